@@ -1,0 +1,107 @@
+"""What an estimator returns: a trajectory with its covariance, calibrations, counts and warnings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tbmfg.timeseries import Floats, Times
+
+ROT, POS, VEL, BA, BG = (slice(i, i + 3) for i in range(0, 15, 3))
+NAV = 15  # size of the navigation error state: rotation (b), position, velocity (n), acc bias, gyro bias
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """States at n keyframes: body b in the navigation frame n.
+
+    ``t_ns`` (n,) int64; ``position_n`` (n, 3) m; ``quat_xyzw`` (n, 4) of R_nb; ``velocity_n`` (n, 3)
+    m/s; ``bias_acc`` (n, 3) m/s^2 and ``bias_gyro`` (n, 3) rad/s in b; ``cov`` (n, 15, 15) in the
+    order and frames of the package docstring.
+    """
+
+    t_ns: Times
+    position_n: Floats
+    quat_xyzw: Floats
+    velocity_n: Floats
+    bias_acc: Floats
+    bias_gyro: Floats
+    cov: Floats
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Reference poses of b in n. ``quat_xyzw`` and ``velocity_n`` are None where the log has none."""
+
+    t_ns: Times
+    position_n: Floats
+    quat_xyzw: Floats | None = None
+    velocity_n: Floats | None = None
+
+
+@dataclass(slots=True)
+class Counts:
+    """Where every sample of one sensor went; the parts sum to ``received`` exactly."""
+
+    received: int = 0
+    used: int = 0
+    gated: int = 0
+    late: int = 0
+    duplicate: int = 0
+    nonfinite: int = 0
+    outage: int = 0
+    unused: int = 0
+
+    def parts(self) -> int:
+        return self.used + self.gated + self.late + self.duplicate + self.nonfinite + self.outage + self.unused
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """A calibration value (float or tuple), its standard deviation, and whether the log estimated it."""
+
+    value: float | tuple[float, ...]
+    sd: float | tuple[float, ...]
+    estimated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Innovations:
+    """Squared normalised residuals of one sensor at its keyframes: ``nis`` (m,), ``dof``, ``gated`` (m,)."""
+
+    t_ns: Times
+    nis: Floats
+    dof: int
+    gated: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A stretch of time worth naming: kind such as "outage", "gap", "zero velocity"."""
+
+    sensor: str
+    kind: str
+    start_ns: int
+    end_ns: int
+
+
+@dataclass(slots=True)
+class Result:
+    """What every estimator returns.
+
+    ``trajectory`` is the plain (for online solvers: causal) one; ``smoothed`` the last estimates,
+    where they differ.
+    """
+
+    estimator: str
+    trajectory: Trajectory
+    smoothed: Trajectory | None = None
+    calibration: dict[str, Calibrated] = field(default_factory=dict)
+    counts: dict[str, Counts] = field(default_factory=dict)
+    innovations: dict[str, Innovations] = field(default_factory=dict)
+    intervals: list[Interval] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
