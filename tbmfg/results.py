@@ -1,0 +1,213 @@
+"""The files of a result, and reading them back."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tbmfg.errors import TbmfgError
+from tbmfg.state import Innovations, Result, Trajectory, Truth
+from tbmfg.timeseries import NS, Floats, Times
+
+SUMMARY = "summary.json"
+# The summary is first to go and last to come: a folder that holds one holds a complete result.
+FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result.mcap", "rig.yaml", SUMMARY)
+
+
+# ---- a result folder ----
+
+
+def refuse_existing(output: str | Path, force: bool) -> None:
+    """Raise unless a result may be written to the folder ``output``."""
+    output = Path(output)
+    if output.exists() and not output.is_dir():
+        raise TbmfgError(f"{output}: is a file; -o wants a folder")
+    existing = [name for name in FILES if (output / name).exists()]
+    if existing and not force:
+        raise TbmfgError(f"{output}: already holds {', '.join(existing)}; give another folder, or --force to replace")
+
+
+def write_result(
+    output: str | Path, result: Result, summary: dict[str, Any], rig_yaml: str, *, force: bool = False
+) -> None:
+    """Write every file of ``result`` to the folder ``output``, which is made where it is missing.
+
+    The files are written under a hidden folder inside ``output`` (so on the same file system) and moved
+    to their names when all are complete.
+    """
+    from tbmfg.mcap import write_trajectory
+
+    def write(folder: Path) -> None:
+        _write_trajectory_files(folder, "trajectory.tum", "result.npz", result.trajectory)
+        if result.smoothed is not None:
+            _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
+        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=diagnostics(result))
+        (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
+        (folder / SUMMARY).write_text(to_json(summary), "utf-8")
+
+    refuse_existing(output, force)
+    write_atomically(Path(output), FILES, write)
+
+
+def write_atomically(output: Path, names: Iterable[str], write: Callable[[Path], None]) -> None:
+    """Run ``write`` on a scratch folder, then move what it wrote to ``output``, in the order of ``names``.
+
+    Files of ``names`` that were there before and are not written again are removed, the last name first.
+    """
+    made = not output.exists()
+    output.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=".partial-", dir=output))
+    try:
+        write(scratch)
+        names = tuple(names)
+        for name in reversed(names):
+            (output / name).unlink(missing_ok=True)
+        for name in names:
+            if (scratch / name).exists():
+                os.replace(scratch / name, output / name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        if made and not any(output.iterdir()):
+            output.rmdir()
+
+
+def _write_trajectory_files(folder: Path, tum: str, npz: str, trajectory: Trajectory) -> None:
+    write_tum(folder / tum, trajectory.t_ns, trajectory.position_n, trajectory.quat_xyzw)
+    np.savez(folder / npz, **{name: getattr(trajectory, name) for name in Trajectory.__slots__})
+
+
+# ---- what a summary says of a result ----
+
+
+def summarise(result: Result, t0_ns: int) -> dict[str, Any]:
+    """Calibration, counts, warnings, intervals and innovations of ``result``.
+
+    Intervals are in seconds from ``t0_ns``, the first IMU sample, as ``--outage`` takes them.
+    ``nis_per_dof`` is the mean squared normalised residual of the accepted updates over its degrees of
+    freedom: 1 where noise and model agree.
+    """
+    return {
+        "calibration": {name: asdict(value) for name, value in result.calibration.items()},
+        "sensors": {name: asdict(counts) for name, counts in result.counts.items()},
+        "warnings": list(result.warnings),
+        "intervals": [
+            {
+                "sensor": interval.sensor,
+                "kind": interval.kind,
+                "start_s": (interval.start_ns - t0_ns) * 1e-9,
+                "end_s": (interval.end_ns - t0_ns) * 1e-9,
+            }
+            for interval in result.intervals
+        ],
+        "innovations": {name: _innovation_summary(values) for name, values in result.innovations.items()},
+    }
+
+
+def _innovation_summary(innovations: Innovations) -> dict[str, Any]:
+    gated = np.asarray(innovations.gated, dtype=bool)
+    accepted = np.asarray(innovations.nis, dtype=float)[~gated]
+    return {
+        "updates": len(gated),
+        "gated": int(gated.sum()),
+        "dof": innovations.dof,
+        "nis_per_dof": float(accepted.mean()) / innovations.dof if len(accepted) else None,
+    }
+
+
+def to_json(value: Any) -> str:
+    """Strict JSON in the given key order; NaN and infinities become null."""
+    return json.dumps(_plain(value), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+# ---- trajectories as text and arrays ----
+
+
+def write_tum(path: str | Path, t_ns: Times, position: Floats, quat_xyzw: Floats) -> None:
+    """Poses as ``t x y z qx qy qz qw`` with 9 decimals; stamps are formatted from integers, so they are exact."""
+    with open(path, "w", encoding="ascii", newline="\n") as file:
+        for t, row in zip(t_ns.tolist(), np.hstack([position, quat_xyzw]).tolist(), strict=True):
+            whole, fraction = divmod(abs(t), NS)
+            file.write(f"{'-' if t < 0 else ''}{whole}.{fraction:09d} " + " ".join(f"{x:.9f}" for x in row) + "\n")
+
+
+def read_tum(path: str | Path) -> Truth:
+    """Poses of a TUM file, sorted by stamp, of equal stamps the first; ``#`` starts a comment.
+
+    Rows that are not finite are left out. All-zero quaternions mean that there is no attitude.
+    """
+    stamps, rows = [], []
+    with open(path, encoding="utf-8") as file:
+        for number, line in enumerate(file, 1):
+            fields = line.partition("#")[0].split()
+            if not fields:
+                continue
+            try:
+                stamp, row = int((Decimal(fields[0]) * NS).to_integral_value()), [float(x) for x in fields[1:]]
+            except (ValueError, InvalidOperation, OverflowError):
+                row = []
+            if len(row) != 7:
+                raise TbmfgError(f"{path}:{number}: not a TUM pose 't x y z qx qy qz qw': {line.strip()[:60]!r}")
+            stamps.append(stamp)
+            rows.append(row)
+    if not rows:
+        raise TbmfgError(f"{path}: holds no poses")
+    table = np.array(rows)
+    return clean_truth(np.array(stamps, dtype=np.int64), table[:, :3], table[:, 3:])
+
+
+def read_result_npz(path: str | Path) -> Trajectory:
+    """The trajectory of ``result.npz`` or ``smoothed.npz``."""
+    with np.load(path) as arrays:
+        missing = [name for name in Trajectory.__slots__ if name not in arrays]
+        if missing:
+            raise TbmfgError(f"{path}: lacks {', '.join(missing)}; is it a result.npz?")
+        return Trajectory(**{name: arrays[name] for name in Trajectory.__slots__})
+
+
+def clean_truth(
+    t_ns: Times, position_n: Floats, quat_xyzw: Floats | None = None, velocity_n: Floats | None = None
+) -> Truth:
+    """Truth in time order without repeated stamps and non-finite rows.
+
+    Quaternions that are all zero, and velocities that are all zero of a body that moves, were never filled
+    in: they become None.
+    """
+    columns = [column for column in (position_n, quat_xyzw, velocity_n) if column is not None]
+    finite = np.isfinite(np.hstack(columns)).all(axis=1)
+    if quat_xyzw is not None:
+        norm = np.linalg.norm(quat_xyzw, axis=1)
+        if norm.any():
+            finite &= norm > 0
+        else:
+            quat_xyzw = None
+    if velocity_n is not None and not velocity_n.any() and np.ptp(position_n, axis=0).any():
+        velocity_n = None
+    stamps, first = np.unique(t_ns[finite], return_index=True)
+    rows = np.flatnonzero(finite)[first]
+    return Truth(
+        t_ns=stamps,
+        position_n=position_n[rows],
+        quat_xyzw=None if quat_xyzw is None else quat_xyzw[rows],
+        velocity_n=None if velocity_n is None else velocity_n[rows],
+    )
