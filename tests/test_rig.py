@@ -1,8 +1,6 @@
 """The rig file: shipped rigs, exact round trips, one line per fault, overrides, conversion to SI."""
 
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -183,11 +181,9 @@ def test_scalars_are_those_of_yaml_1_2():
 
 
 @given(st.text())
-def test_any_text_is_a_rig_or_a_rig_error(text):
-    try:
+def test_any_text_that_is_no_rig_is_a_rig_error(text):
+    with pytest.raises(RigError, match=r"rig\.yaml"):  # no text this short names a topic for an IMU
         parse_rig(text, "rig.yaml")
-    except RigError as error:
-        assert "rig.yaml" in str(error)
 
 
 # ---- overrides ----
@@ -297,9 +293,3 @@ def test_every_field_is_described():
             assert model.__doc__
             undescribed = [name for name, field in model.model_fields.items() if not field.description]
             assert undescribed == [], model.__name__
-
-
-def test_reading_a_rig_needs_no_heavy_package():
-    code = "import sys, tbmfg.rig; tbmfg.rig.load_rig('tbm'); print({'scipy', 'gtsam', 'numba'} & set(sys.modules))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "set()"
