@@ -64,6 +64,7 @@ class Clouds(Protocol):
 
     topic: str
     t_ns: Times
+    frame_id: str
 
     def __len__(self) -> int: ...
 

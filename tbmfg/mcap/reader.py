@@ -1,0 +1,190 @@
+"""MCAP file or rosbag2 folder -> Log."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+from mcap.opcode import Opcode
+
+from tbmfg.errors import LogError
+from tbmfg.mcap import clouds
+from tbmfg.mcap.container import Block, McapFile
+from tbmfg.mcap.layouts import LAYOUTS
+from tbmfg.mcap.schemas import full_name
+from tbmfg.mcap.streams import TRANSFORMS, CloudStream, Entries, SeriesStream, Stream, TransformStream
+from tbmfg.timeseries import Log
+
+_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_SCHEMA_ENCODINGS = ("ros2msg", "ros2idl")
+
+
+@dataclass(slots=True)
+class Recording:
+    """All messages of a recording by topic, before they are sorted and cleaned."""
+
+    path: str
+    streams: dict[str, Stream] = field(default_factory=dict)
+    unknown: dict[str, str] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    messages: int = 0
+
+    def log(self) -> Log:
+        streams = self.streams.values()
+        undecoded = [s for s in streams if isinstance(s, TransformStream) and s.undecodable]
+        return Log(
+            self.path,
+            {s.topic: s.series() for s in streams if isinstance(s, SeriesStream)},
+            {s.topic: s.clouds() for s in streams if isinstance(s, CloudStream)},
+            tuple(t for s in streams if isinstance(s, TransformStream) for t in s.transforms()),
+            self.attachments,
+            self.unknown,
+            (*self.damage, *(f"{s.topic}: {s.undecodable} messages cannot be decoded" for s in undecoded)),
+        )
+
+
+def read_log(
+    path: str | os.PathLike,
+    topics: Collection[str] | None = None,
+    *,
+    progress: Callable[[float], None] | None = None,
+) -> Log:
+    """A recording in columns: ``path`` is an .mcap file, or a rosbag2 folder with metadata.yaml.
+
+    With ``topics`` only these become series and clouds; static transforms and attachments are always read.
+    ``progress`` is called with the fraction done, 0 to 1. Damaged parts are skipped and described in
+    ``Log.damage``. Raises LogError where nothing can be read.
+    """
+    return scan(path, topics, progress).log()
+
+
+def scan(
+    path: str | os.PathLike,
+    topics: Collection[str] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Recording:
+    """One pass over all files of a recording; arguments and errors as ``read_log``."""
+    recording = Recording(str(path))
+    files = recording_files(path)
+    sizes = [file.stat().st_size if file.is_file() else 0 for file in files]
+    for number, file in enumerate(files):
+        try:
+            mcap = McapFile(file)
+        except LogError as error:
+            if len(files) == 1:
+                raise
+            recording.damage.append(str(error))
+            continue
+        with mcap:
+            channels: dict[int, Stream | None] = {}
+            for block in mcap.blocks():
+                _distribute(recording, mcap, block, channels, topics)
+                if progress:
+                    progress((sum(sizes[:number]) + mcap.position) / sum(sizes))
+            recording.attachments |= mcap.attachments
+            recording.damage += mcap.damage
+    if not recording.messages:
+        raise LogError("; ".join([f"{path}: no message could be read from {sum(sizes)} bytes", *recording.damage]))
+    if progress:
+        progress(1.0)
+    return recording
+
+
+def recording_files(path: str | os.PathLike) -> list[Path]:
+    """The MCAP files of a recording in order. Raises LogError for a folder that is not a rosbag2 recording."""
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        count = len(list(path.glob("*.mcap")))
+        raise LogError(f"{path}: a folder without metadata.yaml ({count} .mcap files in it); name one of the files")
+    try:
+        info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+        names = [str(name) for name in info["relative_file_paths"]]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError) as error:
+        raise LogError(
+            f"{metadata}: not a rosbag2 description ({type(error).__name__}: {str(error).splitlines()[0]}); "
+            "rebuild it with: ros2 bag reindex"
+        ) from None
+    storage = info.get("storage_identifier", "mcap")
+    if storage != "mcap" or info.get("compression_mode"):
+        packed = f", compressed by {info['compression_mode']}" if info.get("compression_mode") else ""
+        raise LogError(f"{path}: storage {storage}{packed}; convert it to plain mcap with: ros2 bag convert")
+    if not names:
+        raise LogError(f"{metadata}: names no files; rebuild it with: ros2 bag reindex")
+    # Early rosbag2 wrote the folder's own name into the paths.
+    return [path / name if (path / name).exists() else path / Path(name).name for name in names]
+
+
+def _distribute(
+    recording: Recording,
+    mcap: McapFile,
+    block: Block,
+    channels: dict[int, Stream | None],
+    topics: Collection[str] | None,
+) -> None:
+    """Hand the messages of a block to the streams of their topics."""
+    entries: defaultdict[int, Entries] = defaultdict(list)
+    data, end, at = block.data, len(block.data), 0
+    while at + _HEAD.size <= end:
+        opcode, length = _HEAD.unpack_from(data, at)
+        start = at + _HEAD.size
+        if start + length > end or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+            break
+        at = start + length
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+            entries[channel].append((log_ns, start + _MESSAGE.size, at))
+        else:
+            mcap.declare(opcode, data[start:at])
+    if at < end and block.whole:
+        mcap.damage.append(f"{mcap.name}: {end - at} bytes in the chunk at byte {block.chunk} are no records; skipped")
+    for channel, messages in entries.items():
+        recording.messages += len(messages)
+        if channel not in channels:
+            channels[channel] = _open(recording, mcap, channel, topics)
+        stream = channels[channel]
+        if stream:
+            stream.take(block, mcap.path, messages)
+
+
+def _open(recording: Recording, mcap: McapFile, number: int, topics: Collection[str] | None) -> Stream | None:
+    """The stream for a channel; None where its messages are passed over."""
+    channel = mcap.channels.get(number)
+    if channel is None:
+        mcap.damage.append(f"{mcap.name}: messages of channel {number}, which is declared nowhere, skipped")
+        return None
+    schema = mcap.schemas.get(channel.schema_id)
+    topic, type = channel.topic, full_name(schema.name) if schema else ""
+    static = type == TRANSFORMS and topic.endswith("tf_static")
+    if topics is not None and topic not in topics and not static:
+        return None
+    known = recording.streams.get(topic)
+    if known:
+        if known.type == type:
+            return known
+        mcap.damage.append(f"{mcap.name}: {topic} is {known.type} and also {type or 'of no type'}; the latter skipped")
+        return None
+    stream: Stream = Stream(topic, type)
+    if channel.message_encoding != "cdr":
+        recording.unknown[topic] = f"{type} (message encoding {channel.message_encoding!r})"
+    elif schema and schema.encoding not in _SCHEMA_ENCODINGS:
+        recording.unknown[topic] = f"{type} (schema encoding {schema.encoding!r})"
+    elif type in LAYOUTS:
+        stream = SeriesStream(topic, type, LAYOUTS[type])
+    elif type == clouds.TYPE:
+        stream = CloudStream(topic, type)
+    elif static:
+        stream = TransformStream(topic, type)
+    elif type != TRANSFORMS:  # /tf is understood but not kept: poses over time come as Odometry
+        recording.unknown[topic] = type
+    recording.streams[topic] = stream
+    return stream
