@@ -6,17 +6,23 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from tbmfg.errors import TbmfgError
+from tbmfg.geometry import matrix_from_quat
 from tbmfg.state import Innovations, Result, Trajectory, Truth
-from tbmfg.timeseries import NS, Floats, Times
+from tbmfg.timeseries import NS, Floats, Log, Series, Times
+
+if TYPE_CHECKING:
+    from tbmfg.rig import Rig
 
 SUMMARY = "summary.json"
 # The summary is first to go and last to come: a folder that holds one holds a complete result.
@@ -50,7 +56,7 @@ def write_result(
         _write_trajectory_files(folder, "trajectory.tum", "result.npz", result.trajectory)
         if result.smoothed is not None:
             _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
-        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=diagnostics(result))
+        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=None)
         (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
         (folder / SUMMARY).write_text(to_json(summary), "utf-8")
 
@@ -178,11 +184,77 @@ def read_tum(path: str | Path) -> Truth:
 
 def read_result_npz(path: str | Path) -> Trajectory:
     """The trajectory of ``result.npz`` or ``smoothed.npz``."""
-    with np.load(path) as arrays:
-        missing = [name for name in Trajectory.__slots__ if name not in arrays]
-        if missing:
-            raise TbmfgError(f"{path}: lacks {', '.join(missing)}; is it a result.npz?")
+    with _arrays(path, Trajectory.__slots__) as arrays:
         return Trajectory(**{name: arrays[name] for name in Trajectory.__slots__})
+
+
+@contextmanager
+def _arrays(path: str | Path, names: Iterable[str]) -> Iterator[Any]:
+    """The arrays of an npz file that must hold ``names``."""
+    try:
+        arrays = np.load(path)
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise TbmfgError(f"{path}: is not a readable npz file: {error}") from error
+    with arrays:
+        missing = [name for name in names if name not in arrays]
+        if missing:
+            raise TbmfgError(f"{path}: lacks the array {', '.join(missing)}")
+        yield arrays
+
+
+# ---- truth ----
+
+
+def find_truth(spec: str, log: Log, rig: Rig) -> str | None:
+    """The topic or file that ``spec`` names: "auto", "none", a topic, a TUM file or an npz.
+
+    auto is the rig's topic where the log has it, else a topic whose name contains "truth": of several the
+    one with the most columns (a velocity, an attitude), then the first by name.
+    """
+    if spec == "none":
+        return None
+    if spec == "auto":
+        if rig.truth is not None and rig.truth.topic in log.series:
+            return rig.truth.topic
+        named = sorted(topic for topic in log.series if "truth" in topic.lower() and _position(log.series[topic]))
+        return max(named, key=lambda topic: len(log.series[topic].columns), default=None)
+    if spec in log.series or Path(spec).is_file():
+        return spec
+    posed = ", ".join(topic for topic, series in log.series.items() if _position(series)) or "none"
+    raise TbmfgError(f"--truth {spec}: neither a topic of the log nor a file; topics with positions: {posed}")
+
+
+def load_truth(source: str, log: Log) -> Truth:
+    """Reference poses of b in n from what :func:`find_truth` found.
+
+    Odometry holds its velocity in the child frame (nav_msgs), which is taken to be b, and is turned to n.
+    """
+    if source in log.series:
+        return _truth_of(log.series[source])
+    if Path(source).suffix == ".npz":
+        with _arrays(source, ("t_ns", "position_n")) as arrays:
+            optional = [arrays.get(name) for name in ("quat_xyzw", "velocity_n")]
+            return clean_truth(arrays["t_ns"], arrays["position_n"], *optional)
+    return read_tum(source)
+
+
+def _position(series: Series) -> str | None:
+    return next((name for name in ("position", "point") if name in series.columns), None)
+
+
+def _truth_of(series: Series) -> Truth:
+    position = _position(series)
+    if position is None:
+        raise TbmfgError(f"{series.topic}: {series.type} holds no positions, so it cannot be the truth")
+    truth = clean_truth(series.t_ns, series[position], series.columns.get("quat_xyzw"), series.columns.get("linear"))
+    if not len(truth.t_ns):
+        raise TbmfgError(f"{series.topic}: none of its {len(series)} poses is finite, so it cannot be the truth")
+    if truth.velocity_n is None:
+        return truth
+    if truth.quat_xyzw is None:
+        return replace(truth, velocity_n=None)
+    R_nb = matrix_from_quat(truth.quat_xyzw)
+    return replace(truth, velocity_n=np.einsum("nij,nj->ni", R_nb, truth.velocity_n))
 
 
 def clean_truth(
@@ -190,24 +262,22 @@ def clean_truth(
 ) -> Truth:
     """Truth in time order without repeated stamps and non-finite rows.
 
-    Quaternions that are all zero, and velocities that are all zero of a body that moves, were never filled
-    in: they become None.
+    A column that is never filled in becomes None: nowhere finite, quaternions all zero, or velocities all
+    zero of a body that moves.
     """
-    columns = [column for column in (position_n, quat_xyzw, velocity_n) if column is not None]
-    finite = np.isfinite(np.hstack(columns)).all(axis=1)
     if quat_xyzw is not None:
-        norm = np.linalg.norm(quat_xyzw, axis=1)
-        if norm.any():
-            finite &= norm > 0
-        else:
-            quat_xyzw = None
+        quat_xyzw = np.where(np.linalg.norm(quat_xyzw, axis=1, keepdims=True) > 0, quat_xyzw, np.nan)
     if velocity_n is not None and not velocity_n.any() and np.ptp(position_n, axis=0).any():
         velocity_n = None
+    finite = np.isfinite(position_n).all(axis=1)
+    optional = []
+    for column in (quat_xyzw, velocity_n):
+        filled = None if column is None else np.isfinite(column).all(axis=1)
+        if filled is None or not filled.any():
+            optional.append(None)
+        else:
+            optional.append(column)
+            finite &= filled
     stamps, first = np.unique(t_ns[finite], return_index=True)
     rows = np.flatnonzero(finite)[first]
-    return Truth(
-        t_ns=stamps,
-        position_n=position_n[rows],
-        quat_xyzw=None if quat_xyzw is None else quat_xyzw[rows],
-        velocity_n=None if velocity_n is None else velocity_n[rows],
-    )
+    return Truth(stamps, position_n[rows], *(None if column is None else column[rows] for column in optional))

@@ -27,12 +27,11 @@ def drive(n: int = 200, dt: float = 0.1) -> Truth:
     return Truth(EPOCH_NS + np.rint(t * 1e9).astype(np.int64), position, R.as_quat(), velocity)
 
 
-def estimate(truth: Truth, rotation_b=(0.0, 0.0, 0.0), position_n=0.0, velocity_n=0.0, cov=None) -> Trajectory:
+def estimate(truth: Truth, rotation_b=0.0, position_n=0.0, velocity_n=0.0, cov=None) -> Trajectory:
     """The truth with these errors; R_est = R_true Exp(rotation_b)."""
     n = len(truth.t_ns)
-    R = Rotation.from_quat(truth.quat_xyzw) * Rotation.from_rotvec(
-        np.tile(rotation_b, (n, 1)) if np.ndim(rotation_b) < 2 else rotation_b
-    )
+    rotvec = np.array(np.broadcast_to(rotation_b, (n, 3)))
+    R = Rotation.from_quat(truth.quat_xyzw) * Rotation.from_rotvec(rotvec)
     return Trajectory(
         t_ns=truth.t_ns,
         position_n=truth.position_n + position_n,
@@ -216,7 +215,7 @@ def test_ape_equals_evo(tmp_path):
     rng = np.random.default_rng(6)
     truth = drive(300)
     tilted = Rotation.from_rotvec([0.05, -0.02, 0.7]).apply(truth.position_n + rng.normal(0, 0.05, (300, 3)))
-    found = replace(estimate(truth), position_n=tilted + [5.0, -3.0, 1.0])
+    found = replace(estimate(truth), position_n=tilted + np.array([5.0, -3.0, 1.0]))
     write_tum(tmp_path / "truth.tum", truth.t_ns, truth.position_n, truth.quat_xyzw)
     write_tum(tmp_path / "found.tum", found.t_ns, found.position_n, found.quat_xyzw)
     ran = subprocess.run(

@@ -1,0 +1,3 @@
+from tbmfg.cli import main
+
+main()

@@ -1,0 +1,132 @@
+"""From a log to a folder of results: what the command line, batch jobs and Python users all call."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tbmfg import __version__
+from tbmfg.errors import RigError, TbmfgError
+from tbmfg.results import find_truth, load_truth, refuse_existing, summarise, write_result
+from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
+from tbmfg.timeseries import NS, Log
+
+Progress = Callable[[str, float], None]
+Outage = tuple[str, float, float]
+
+ATTACHED_RIG = "rig.yaml"
+
+
+def run(
+    log_path: str | Path,
+    *,
+    rig: Rig | str | Path | None = None,
+    estimator: str = "batch",
+    truth: str = "auto",
+    output: str | Path | None = None,
+    outages: Sequence[Outage] = (),
+    without: Collection[str] = (),
+    only: Collection[str] = (),
+    overrides: Sequence[str] = (),
+    force: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files.
+
+    ``rig``: a Rig, a shipped name or a file; None takes the one attached to the log. ``outages``: (sensor,
+    start, end) in seconds from the first IMU sample, stamps as recorded. ``without`` drops sensors, ``only``
+    keeps just these and the IMU. ``overrides``: ``key.path=value`` over the rig. ``progress`` is called
+    with the stage and the done fraction of it. ``wall_s`` is the time from opening the log to the result: without
+    evaluating, writing and the imports that can be done before.
+    """
+    from tbmfg.estimators import ESTIMATORS, estimate
+    from tbmfg.evaluation.metrics import evaluate
+    from tbmfg.mcap import read_log
+    from tbmfg.prepare import prepare
+
+    if estimator not in ESTIMATORS:
+        raise TbmfgError(f"no estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
+    if output is not None:
+        refuse_existing(output, force)
+
+    started = time.perf_counter()
+    log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
+    rig = rig_for(log, rig, overrides)
+    without = dropped_sensors(rig, without, only, [sensor for sensor, _, _ in outages])
+    reference = find_truth(truth, log, rig)
+    prepared = prepare(log, rig, outages=tuple(outages), without=without, progress=progress)
+    result = estimate(estimator, prepared, progress=progress)
+    wall_s = time.perf_counter() - started
+
+    result.warnings = list(dict.fromkeys([*log.damage, *prepared.warnings, *result.warnings]))
+    span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
+    summary: dict[str, Any] = {
+        "tbmfg_version": __version__,
+        "log": str(log_path),
+        "rig": prepared.rig.name,
+        "estimator": estimator,
+        "truth": reference,
+        "options": {"outages": list(outages), "without": without, "set": list(overrides)},
+        "keyframes": len(result.trajectory),
+        "duration_s": span_ns / NS,
+        "wall_s": wall_s,
+        "realtime_factor": span_ns / NS / wall_s,
+        "peak_rss_mb": None,
+        **summarise(result, prepared.t0_ns),
+        "metrics": None,
+    }
+    if reference is not None:
+        poses = load_truth(reference, log)
+        lost = [(prepared.t0_ns + round(start * NS), prepared.t0_ns + round(end * NS)) for _, start, end in outages]
+        summary["metrics"] = evaluate(result.trajectory, poses, lost)
+        if result.smoothed is not None:
+            summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
+    summary["peak_rss_mb"] = peak_rss_mb()
+    if output is not None:
+        write_result(output, result, summary, dump_rig(prepared.rig), force=force)
+    return summary
+
+
+def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> Rig:
+    """The rig given, else the one attached to the log, with ``overrides`` applied."""
+    if rig is None:
+        if ATTACHED_RIG not in log.attachments:
+            raise RigError(f"{log.path}: has no rig attached; name one with --rig NAME or --rig FILE")
+        source = f"{log.path}: attachment {ATTACHED_RIG}"
+        try:
+            rig = parse_rig(log.attachments[ATTACHED_RIG].decode("utf-8"), source)
+        except UnicodeDecodeError as error:
+            raise RigError(f"{source}: cannot be read: not UTF-8 text") from error
+    elif not isinstance(rig, Rig):
+        rig = load_rig(rig)
+    return override(rig, overrides) if overrides else rig
+
+
+def dropped_sensors(
+    rig: Rig, without: Collection[str], only: Collection[str], outages: Collection[str] = ()
+) -> tuple[str, ...]:
+    """The sensors of ``rig`` that ``without`` and ``only`` leave out, every name given being checked."""
+    for option, names in (("--without", without), ("--only", only), ("--outage", outages)):
+        for name in names:
+            if name not in rig.sensors:
+                raise TbmfgError(
+                    f"{option} {name}: the rig {rig.name} has no such sensor; it has {', '.join(rig.sensors)}"
+                )
+    if "imu" in without:
+        raise TbmfgError("--without imu: every estimator needs the IMU")
+    kept = {"imu", *only} if only else set(rig.sensors)
+    return tuple(name for name in rig.sensors if name not in kept or name in without)
+
+
+def peak_rss_mb() -> float | None:
+    """Largest memory of this process so far, in 10^6 bytes; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if sys.platform == "darwin" else 1024) / 1e6

@@ -1,0 +1,285 @@
+"""Command line and pipeline: exit codes, one-line errors, options as given, and nothing drawn in a pipe."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tbmfg import cli, pipeline
+from tbmfg.errors import LogError, TbmfgError
+from tbmfg.rig import parse_rig
+from tbmfg.state import Calibrated, Counts, Result, Trajectory
+from tbmfg.timeseries import Log, Series
+
+EPOCH_NS = 1_700_000_000_000_000_000
+RIG = "name: toy\nsensors: {imu: {topic: /imu}, prism: {topic: /prism}, odometer: {topic: /odometry}}\n"
+ROOT = Path(__file__).parent.parent
+
+
+def poses(n: int = 50, shift: float = 0.0) -> Trajectory:
+    s = np.linspace(0.0, 1.0, n)[:, None]
+    return Trajectory(
+        t_ns=EPOCH_NS + np.arange(n) * 200_000_000,
+        position_n=np.hstack([10 * s + shift, 3 * s**2, np.sin(s)]),
+        quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        velocity_n=np.zeros((n, 3)),
+        bias_acc=np.zeros((n, 3)),
+        bias_gyro=np.zeros((n, 3)),
+        cov=np.tile(np.eye(15), (n, 1, 1)),
+    )
+
+
+def toy_log() -> Log:
+    true = poses()
+    columns = {"position": true.position_n, "quat_xyzw": true.quat_xyzw}
+    truth = Series("/truth", "geometry_msgs/msg/PoseStamped", true.t_ns, columns)
+    return Log("toy.mcap", {"/truth": truth}, attachments={"rig.yaml": RIG.encode()})
+
+
+def toy_estimate(name, prepared, *, progress=None) -> Result:
+    if progress:
+        progress("solving", 1.0)
+    return Result(
+        name,
+        poses(shift=0.5),
+        smoothed=poses() if name == "fixed-lag" else None,
+        calibration={
+            "prism_lever_arm_m": Calibrated((0.1, 0.2, 0.3), (0.001, 0.002, 0.003), True),
+            "noise_factor": Calibrated(2.0, 0.0, False),
+        },
+        counts={"prism": Counts(received=50, used=48, gated=2)},
+        warnings=["odometer: not estimated"],
+    )
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """The stages replaced by fakes; the calls that reach them are recorded."""
+    calls = SimpleNamespace(prepare=[], logs={"toy.mcap": toy_log()})
+
+    def read_log(path, *, progress=None):
+        if str(path) not in calls.logs:
+            raise LogError(f"{path}: no such file")
+        return calls.logs[str(path)]
+
+    def prepare(log, rig, *, outages=(), without=(), progress=None):
+        calls.prepare.append({"rig": rig, "outages": outages, "without": without, "progress": progress})
+        return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, warnings=["imu: 3 samples lost"])
+
+    entry = SimpleNamespace(summary="Smoother.", needs=("imu", "prism"), source="tbmfg")
+    names = {"batch": entry, "fixed-lag": entry}
+    fakes = SimpleNamespace(ESTIMATORS=names, estimate=lambda *args, **options: calls.estimate(*args, **options))
+    calls.estimate = toy_estimate
+    monkeypatch.setitem(sys.modules, "tbmfg.estimators", fakes)
+    monkeypatch.setitem(sys.modules, "tbmfg.prepare", SimpleNamespace(prepare=prepare))
+    monkeypatch.setattr("tbmfg.mcap.read_log", read_log)
+    return calls
+
+
+def tbmfg(*arguments: str):
+    return CliRunner().invoke(cli.app, list(arguments), prog_name="tbmfg")
+
+
+# ---- running ----
+
+
+def test_run_writes_and_prints(toy, tmp_path):
+    ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path / "out"))
+    assert ran.exit_code == 0, ran.output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    design = "tbmfg_version log estimator keyframes duration_s wall_s realtime_factor peak_rss_mb calibration sensors"
+    assert [key for key in summary if key in design.split()] == design.split()
+    assert summary["warnings"] == ["imu: 3 samples lost", "odometer: not estimated"]
+    assert summary["truth"] == "/truth"
+    assert summary["metrics"]["position_rms_m"] == pytest.approx(0.5)
+    assert summary["metrics"]["ape_rms_m"] == pytest.approx(0.0, abs=1e-9)
+    assert "metrics_smoothed" not in summary
+    for shown in ("50 keyframes over 9.8 s", "prism_lever_arm_m", "0.1 0.2 0.3", "gated", "position_rms_m", "/truth"):
+        assert shown in ran.stdout
+    assert "warning: odometer: not estimated" in ran.stdout
+    assert f"results: {tmp_path / 'out'}" in ran.stdout
+    assert parse_rig((tmp_path / "out" / "rig.yaml").read_text(), "rig.yaml").name == "toy"
+
+
+def test_smoothed_trajectories_have_their_own_metrics(toy, tmp_path):
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--estimator", "fixed-lag").exit_code == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["metrics_smoothed"]["position_rms_m"] == 0.0
+    assert (tmp_path / "smoothed.tum").exists()
+
+
+def test_options_reach_the_stages(toy, tmp_path):
+    ran = tbmfg(
+        *("run", "toy.mcap", "-o", str(tmp_path), "--truth", "none"),
+        *("--outage", "prism:2:4.5", "--outage", "prism:6:7", "--without", "odometer"),
+        *("--set", "sensors.prism.sigma_mm=7", "--set", "lag_s=3"),
+    )
+    assert ran.exit_code == 0, ran.output
+    (call,) = toy.prepare
+    assert call["outages"] == (("prism", 2.0, 4.5), ("prism", 6.0, 7.0))
+    assert call["without"] == ("odometer",)
+    assert call["rig"].sensors["prism"].sigma_mm == 7
+    assert call["rig"].lag_s == 3
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["options"]["set"] == ["sensors.prism.sigma_mm=7", "lag_s=3"]
+    assert summary["metrics"] is None
+
+
+def test_only_keeps_the_imu(toy, tmp_path):
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--only", "prism").exit_code == 0
+    assert toy.prepare[0]["without"] == ("odometer",)
+
+
+def test_outages_are_seconds_from_the_first_imu_sample(toy, monkeypatch):
+    toy.estimate = lambda name, prepared, *, progress=None: Result(name, half_shifted)
+    half_shifted = poses()
+    half_shifted.position_n[25:, 0] += 2.0  # from 5.0 s on
+    summary = pipeline.run("toy.mcap", outages=[("prism", 4.0, 5.9)])
+    assert summary["metrics"]["outage_position_rms_m"] == pytest.approx(2.0 * np.sqrt(5 / 10))
+
+
+def test_python_users_get_the_summary_without_files(toy, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert pipeline.run("toy.mcap", rig=parse_rig(RIG, "here"))["keyframes"] == 50
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_is_drawn_on_a_terminal_only(toy, tmp_path, monkeypatch):
+    ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path))
+    assert toy.prepare[0]["progress"] is None
+    assert ran.stderr == ""
+    monkeypatch.setattr(cli.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=len, flush=lambda: None))
+    with cli._progress_bar() as progress:
+        progress("solving", 0.5)
+
+
+def test_estimators_lists_names_needs_and_source(toy):
+    ran = tbmfg("estimators")
+    assert ran.exit_code == 0
+    assert all(word in ran.stdout for word in ("batch", "fixed-lag", "imu, prism", "Smoother."))
+
+
+# ---- faults ----
+
+
+def fault(*arguments: str) -> str:
+    """The message of a run that fails with exit code 1, in one line on stderr and nothing on stdout."""
+    ran = tbmfg(*arguments)
+    assert ran.exit_code == 1, ran.output
+    assert ran.stdout == ""
+    assert ran.stderr.count("\n") == 1
+    return ran.stderr
+
+
+def test_faults_of_the_input_take_one_line(toy, tmp_path):
+    out = str(tmp_path / "out")
+    assert "absent.mcap: no such file" in fault("run", "absent.mcap", "-o", out)
+    assert "neither a file nor a shipped rig" in fault("run", "toy.mcap", "-o", out, "--rig", "nonsense")
+    assert "the rig toy has no such sensor" in fault("run", "toy.mcap", "-o", out, "--without", "prisma")
+    assert "every estimator needs the IMU" in fault("run", "toy.mcap", "-o", out, "--without", "imu")
+    assert "--only gnss" in fault("run", "toy.mcap", "-o", out, "--only", "prism,gnss")
+    assert "--outage gnss" in fault("run", "toy.mcap", "-o", out, "--outage", "gnss:1:2")
+    assert "sigma" in fault("run", "toy.mcap", "-o", out, "--set", "sensors.prism.sigma=7")
+    assert "--truth /nope" in fault("run", "toy.mcap", "-o", out, "--truth", "/nope")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_log_without_rig_says_how_to_give_one(toy, tmp_path):
+    toy.logs["bare.mcap"] = Log("bare.mcap", {})
+    assert "--rig NAME or --rig FILE" in fault("run", "bare.mcap", "-o", str(tmp_path / "out"))
+
+
+def test_existing_results_are_refused_before_any_work(toy, tmp_path):
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path)).exit_code == 0
+    assert "--force" in fault("run", "toy.mcap", "-o", str(tmp_path))
+    assert len(toy.prepare) == 1
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--force").exit_code == 0
+
+
+def test_the_unexpected_takes_one_line_and_debug_shows_it(toy, tmp_path):
+    def broken(*args, **options):
+        raise ZeroDivisionError("first line\nsecond line")
+
+    toy.estimate = broken
+    line = fault("run", "toy.mcap", "-o", str(tmp_path))
+    assert "internal error: ZeroDivisionError: first line second line; rerun with --debug" in line
+    ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--debug")
+    assert ran.exit_code == 1
+    assert "Traceback" in ran.stderr
+
+
+def test_an_unknown_estimator_is_an_error_in_python_too(toy):
+    with pytest.raises(TbmfgError, match="there are batch, fixed-lag"):
+        pipeline.run("toy.mcap", estimator="nope")
+
+
+# ---- usage ----
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["--outage", "prism:4:2"],
+        ["--outage", "prism:1"],
+        ["--outage", "1:2"],
+        ["--outage", "prism:a:b"],
+        ["--outage", "prism:1:nan"],
+        ["--set", "lag_s"],
+        ["--set", "=3"],
+        ["--estimator", "nope"],
+        ["--nonsense"],
+        ["second.mcap"],
+    ],
+)
+def test_wrong_usage_is_exit_code_2(toy, tmp_path, wrong):
+    ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path / "out"), *wrong)
+    assert ran.exit_code == 2
+    assert "Traceback" not in ran.output
+    assert toy.prepare == []
+
+
+@pytest.mark.parametrize("arguments", [[], ["run"], ["run", "toy.mcap"], ["nonsense"], ["info"]])
+def test_missing_arguments_are_exit_code_2(arguments):
+    assert tbmfg(*arguments).exit_code == 2
+
+
+def test_an_outage_names_sensor_and_seconds():
+    assert cli.parse_outage("prism-left:-1.5:2e1") == ("prism-left", -1.5, 20.0)
+
+
+# ---- as a process ----
+
+
+def process(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-m", "tbmfg", *arguments], capture_output=True, text=True, cwd=ROOT)
+
+
+def test_help_answers_at_once():
+    """It imports nothing heavy; half a second is what a user takes for at once."""
+    listed = "import sys, tbmfg.cli; print([m for m in ('numpy', 'scipy', 'gtsam', 'pydantic') if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", listed], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert ran.stdout.strip() == "[]"
+    taken = []
+    for _ in range(3):
+        started = time.perf_counter()
+        ran = process("--help")
+        taken.append(time.perf_counter() - started)
+    assert ran.returncode == 0
+    assert "run" in ran.stdout
+    assert min(taken) < 0.5 or os.getloadavg()[0] > os.cpu_count()
+
+
+def test_version_and_exit_codes_of_the_process(tmp_path):
+    assert process("--version").stdout.startswith("tbmfg ")
+    assert process("run").returncode == 2
+    ran = process("info", str(tmp_path / "absent.mcap"))
+    assert ran.returncode == 1
+    assert ran.stderr.count("\n") == 1
+    assert "absent.mcap" in ran.stderr
