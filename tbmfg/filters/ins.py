@@ -1,0 +1,130 @@
+"""The error-state Kalman filter with all sensors: the honest filter rival, and the source of initial values.
+
+Between keyframes it mechanises every IMU step; at a keyframe it corrects with that keyframe's rows. A
+clone of the previous keyframe's pose rides along, so that a displacement (odometer) is measured between
+the two, as in the graph. Rows beyond the chi-square 99.9 % point are gated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from tbmfg.filters.kalman import correct, innovation
+from tbmfg.inertial.strapdown import correct_state, propagate
+from tbmfg.problem import Problem
+from tbmfg.sensors import Rows
+from tbmfg.state import NAV
+from tbmfg.timeseries import Floats
+
+GATE = 0.999  # probability inside the gate
+REOPEN = 10  # rows of one sensor gated in a row after which the next is let in: the state is wrong, not the sensor
+LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
+
+
+@dataclass(frozen=True, slots=True)
+class Filtered:
+    """States (n, 21 + e) and covariances (n, 15 + e, 15 + e) after each keyframe's rows, calibrations (m,) with
+    covariance (m, m) at the end, per sensor NIS and gate flags by row, and the likelihood cost
+    sum(min(nis, gate) + log det S)."""
+
+    x: Floats
+    cov: Floats
+    c: Floats
+    c_cov: Floats
+    nis: dict[str, Floats]
+    gated: dict[str, np.ndarray]
+    cost: float
+    reopened: dict[str, int]
+
+
+def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float], None] | None = None) -> Filtered:
+    """Filter the whole problem. Parameters whose name ends in one of ``fixed`` are held at their start."""
+    inertial, parameters, e = problem.inertial, problem.parameters, len(problem.drift_walk)
+    steps = inertial.steps
+    noise = inertial.psd_gyro, inertial.psd_acc, inertial.psd_bg, inertial.psd_ba, inertial.earth_n, inertial.gravity_n
+    free = np.array([k for k in parameters.free if not parameters.names[k].endswith(tuple(fixed) or ("\0",))], dtype=int)
+    d, m, n = NAV + e, len(free), len(problem.keyframes_s)
+    calib, clone = slice(d, d + m), slice(d + m, d + m + 6)
+
+    x, c = problem.prior.x.copy(), parameters.start.copy()
+    P = np.zeros((d + m + 6, d + m + 6))
+    P[:d, :d] = problem.prior.filter_cov
+    P[calib, calib] = np.diag(parameters.sd[free] ** 2)
+    previous = x.copy()
+
+    xs, covs = np.empty((n, len(x))), np.empty((n, d, d))
+    nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
+    gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
+    in_a_row, reopened = dict.fromkeys(nis, 0), dict.fromkeys(nis, 0)
+    starts = {rows.sensor: np.searchsorted(rows.j, np.arange(n + 1)) for rows in problem.rows}
+    gates = {rows.sensor: chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+    columns = {rows.sensor: np.flatnonzero(np.isin(np.arange(len(c))[rows.calib], free)) for rows in problem.rows}
+    offsets = {rows.sensor: np.searchsorted(free, rows.calib.start) for rows in problem.rows}
+    cost = 0.0
+
+    for k in range(n):
+        if k > 0:
+            previous = x.copy()
+            _clone(P, clone)
+            t0, t1 = problem.keyframes_s[k - 1], problem.keyframes_s[k]
+            pieces = max(1, int(np.ceil((t1 - t0) / LONGEST_S - 1e-9)))
+            for piece in range(pieces):
+                a, b = t0 + (t1 - t0) * piece / pieces, t0 + (t1 - t0) * (piece + 1) / pieces
+                x[:21], Phi, Q = propagate(x[:21], a, b, steps.edges_s, inertial.gyro, inertial.acc, *noise)
+                P[:NAV] = Phi @ P[:NAV]
+                P[:, :NAV] = P[:, :NAV] @ Phi.T
+                P[:NAV, :NAV] += Q
+            P[np.arange(NAV, d), np.arange(NAV, d)] += problem.drift_walk**2 * (t1 - t0)
+        for rows in problem.rows:
+            sensor = rows.sensor
+            for r in range(starts[sensor][k], starts[sensor][k + 1]):
+                residual, H = _linearise(rows, r, x, previous, c, P.shape[0], d, m, columns[sensor], offsets[sensor])
+                value, logdet = innovation(P, H, residual)
+                nis[sensor][r] = value
+                cost += min(value, gates[sensor]) + logdet
+                if value > gates[sensor] and in_a_row[sensor] < REOPEN:
+                    gated[sensor][r] = True
+                    in_a_row[sensor] += 1
+                    continue
+                if in_a_row[sensor] >= REOPEN:
+                    reopened[sensor] += 1
+                in_a_row[sensor] = 0
+                dx, P = correct(P, H, residual)
+                x = correct_state(x, dx[:d])
+                c[free] += dx[calib]
+                previous[:12] = correct_state(previous, np.concatenate([dx[clone], np.zeros(d - 6)]))[:12]
+        xs[k], covs[k] = x, P[:d, :d]
+        if progress is not None and k % 500 == 0:
+            progress(k / n)
+    c_cov = np.zeros((len(c), len(c)))
+    c_cov[np.ix_(free, free)] = P[calib, calib]
+    return Filtered(xs, covs, c, c_cov, nis, gated, float(cost), reopened)
+
+
+def _clone(P: Floats, clone: slice) -> None:
+    """Make the clone's block a copy of the current pose (rotation and position), in place."""
+    P[clone] = P[:6]
+    P[:, clone] = P[:, :6]
+    P[clone, clone] = P[:6, :6]
+
+
+def _linearise(rows: Rows, r: int, x, previous, c, size, d, m, columns, offset) -> tuple[Floats, Floats]:
+    """Whitened residual and Jacobian to [state, free calibrations, clone] of one row."""
+    pair = np.stack([previous, x])
+    one = slice(r, r + 1)
+    binary = rows.i[r] != rows.j[r]
+    parts = rows.evaluate_at(pair[:1] if binary else pair[1:], pair[1:], c, one)
+    residual, Ji, Jj, Jc = (part[0] for part in parts)
+    H = np.zeros((len(residual), size))
+    if binary:
+        H[:, d + m :] = Ji[:, :6]
+        H[:, :d] = Jj
+        H[:, 6:d] += Ji[:, 6:]  # velocity and biases of the previous keyframe are taken as the present ones
+    else:
+        H[:, :d] = Ji
+    H[:, d + offset : d + offset + len(columns)] = Jc[:, columns]
+    return residual, H

@@ -1,0 +1,185 @@
+"""From recorded samples to rows: which keyframe each measurement belongs to, carried there by the gyro."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tbmfg.earth import north_direction
+from tbmfg.inertial.steps import Steps, step_index
+from tbmfg.rig import Barometer, Keyframes, Magnetometer, Odometer, PositionSensor
+from tbmfg.sensors import Rows
+from tbmfg.timeseries import Floats
+
+SHARED_S = 1e-3  # stamps this close share a keyframe
+RATE_WINDOW_S = 0.02  # the angular rate at a fix is a mean over this much on either side
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Accepted samples of one sensor: stamps in s since the log's first IMU sample (clock offset not removed)."""
+
+    sensor: str
+    t_s: Floats
+    values: Floats
+
+
+def keyframe_times(rule: Keyframes, start_s: float, end_s: float, fixes_s: Floats) -> Floats:
+    """Keyframe times: the span's ends, every fix (at most ``max_rate_hz``), and what fills gaps to ``max_gap_s``."""
+    wanted = np.unique(np.concatenate([[start_s], fixes_s[(fixes_s > start_s) & (fixes_s < end_s)], [end_s]]))
+    closest = max(SHARED_S, (1 - 1e-6) / rule.max_rate_hz)
+    if np.any(np.diff(wanted) < closest):
+        kept = [wanted[0]]
+        for t in wanted[1:-1]:
+            if t - kept[-1] >= closest:
+                kept.append(t)
+        if end_s - kept[-1] < SHARED_S and len(kept) > 1:
+            kept.pop()
+        wanted = np.array([*kept, end_s])
+    parts = np.maximum(np.ceil(np.diff(wanted) / rule.max_gap_s - 1e-9).astype(int), 1)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(wanted[:-1], wanted[1:], parts, strict=True)]
+    return np.concatenate([*pieces, wanted[-1:]])
+
+
+def nearest(keyframes_s: Floats, t_s: Floats) -> np.ndarray:
+    """Index of the keyframe nearest to each time."""
+    right = np.clip(np.searchsorted(keyframes_s, t_s), 1, len(keyframes_s) - 1)
+    return np.where(t_s - keyframes_s[right - 1] < keyframes_s[right] - t_s, right - 1, right)
+
+
+@dataclass(frozen=True, slots=True)
+class GyroFrame:
+    """Attitude by gyro alone relative to the first edge: carries vectors over the fractions of a second to a keyframe."""
+
+    steps: Steps
+    R_0t: Floats  # (n + 1, 3, 3)
+    gyro: Floats  # (n, 3), bias removed
+    bias_gyro: Floats
+
+    def at(self, t_s: Floats) -> Floats:
+        """R_0b at any time, (n, 3, 3): the attitude at the step's start, turned at the step's rate."""
+        from tbmfg.geometry import exp_so3
+
+        k = step_index(self.steps, t_s)
+        return self.R_0t[k] @ exp_so3(self.gyro[k] * (t_s - self.steps.edges_s[k])[:, None])
+
+    def rate(self, t_s: Floats, window_s: float = RATE_WINDOW_S) -> Floats:
+        """Mean angular rate in b [rad/s] around each time, (n, 3)."""
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(self.gyro * self.steps.dt[:, None], axis=0)])
+        edges = self.steps.edges_s
+        low, high = np.clip(t_s - window_s, edges[0], edges[-1]), np.clip(t_s + window_s, edges[0], edges[-1])
+        angle = [np.interp(high, edges, total[:, a]) - np.interp(low, edges, total[:, a]) for a in range(3)]
+        return np.stack(angle, axis=1) / (high - low)[:, None]
+
+
+def position_rows(
+    sensor: PositionSensor, fixes: Samples, offset_s: float, keyframes_s: Floats, frame: GyroFrame, origin_n: Floats, calib: slice
+) -> Rows:
+    """Fixes of a prism or antenna at their true times; sigma from the rig at the measured range."""
+    t = fixes.t_s - offset_s
+    k = nearest(keyframes_s, t)
+    data = np.column_stack([t - keyframes_s[k], frame.rate(t)])
+    sigma = np.repeat(sensor.sigma_at(fixes.values)[:, None], 3, axis=1)
+    ones = np.ones(len(t), dtype=int)
+    return Rows(fixes.sensor, "prism", k, k, fixes.values - origin_n, data, sigma, calib, ones, sensor.loss)
+
+
+def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame: GyroFrame, calib: slice) -> Rows:
+    """Displacement between keyframes; ``speeds.values`` (n,) m/s, each the mean over the period that ends at its stamp.
+
+    Intervals that the samples do not cover are left out.
+    """
+    period = float(np.median(np.diff(speeds.t_s)))
+    ends = speeds.t_s - sensor.clock_offset
+    starts = np.maximum(ends - period, np.concatenate([[-np.inf], ends[:-1]]))
+    steps = frame.steps
+    middle = 0.5 * (steps.edges_s[:-1] + steps.edges_s[1:])
+    k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)
+    covered = (middle > starts[k] - 0.01 * period) & (middle <= ends[k])
+    v = np.where(covered, speeds.values[k], 0.0)
+
+    R_mid = frame.at(middle)
+    travel = v * steps.dt
+    M = _cumulative(R_mid * travel[:, None, None])
+    sweep = _cumulative(R_mid[:, :, 0] * (travel * middle)[:, None])
+    cover = _cumulative(covered * steps.dt)
+    edges = [_interpolate(steps.edges_s, values, keyframes_s) for values in (M, sweep, cover)]
+    dM, dsweep, dcover = (np.diff(values, axis=0) for values in edges)
+
+    R_i = frame.at(keyframes_s[:-1]).transpose(0, 2, 1)
+    dsweep = dsweep - dM[:, :, 0] * keyframes_s[:-1, None]
+    length = np.diff(keyframes_s)
+    i = np.flatnonzero(dcover > 0.999 * length - 1e-9)
+    turned_M = (R_i @ dM)[i].reshape(-1, 9)
+    B = np.einsum("kij,kj->ki", R_i, dsweep)[i]
+    constant = np.tile(sensor.arm, (len(i), 1)), np.tile(frame.bias_gyro, (len(i), 1))
+    data = np.column_stack([turned_M, constant[0], B, constant[1]])
+    # white noise per sample of one period: over a time T it leaves a displacement of sigma sqrt(period T)
+    per_sample = np.array([sensor.sigma, sensor.lateral_sigma, sensor.lateral_sigma])
+    sigma = per_sample * np.sqrt(period * length[i])[:, None]
+    samples = np.searchsorted(ends, keyframes_s[i + 1] + 1e-9) - np.searchsorted(ends, keyframes_s[i] + 1e-9)
+    return Rows(speeds.sensor, "odometer", i, i + 1, np.zeros((len(i), 0)), data, sigma, calib, samples, sensor.loss)
+
+
+def magnetometer_rows(
+    sensor: Magnetometer, fields: Samples, keyframes_s: Floats, frame: GyroFrame, x_axis_azimuth: float, calib: slice
+) -> Rows:
+    """Fields averaged to the nearest keyframe, carried there by the gyro."""
+    t = fields.t_s - sensor.clock_offset
+    b = (fields.values - sensor.hard_iron) @ sensor.R_bm.T
+    k = nearest(keyframes_s, t)
+    carried = np.einsum("nij,nj->ni", frame.at(t), b)
+    used, mean, count = _group(k, carried)
+    z = np.einsum("nji,nj->ni", frame.at(keyframes_s[used]), mean)
+    north = np.full((len(used), 1), north_direction(x_axis_azimuth))
+    sigma = (sensor.sigma / np.sqrt(count))[:, None]
+    return Rows(fields.sensor, "magnetometer", used, used, z, north, sigma, calib, count, sensor.loss)
+
+
+def barometer_rows(sensor: Barometer, heights: Samples, keyframes_s: Floats, origin_n: Floats, drift: int) -> Rows:
+    """Pressure heights averaged to the nearest keyframe; ``heights.values`` (n,) m; ``drift`` the index of the bias."""
+    t = heights.t_s - sensor.clock_offset
+    k = nearest(keyframes_s, t)
+    used, mean, count = _group(k, np.column_stack([heights.values - origin_n[2], t - keyframes_s[k]]))
+    data = np.column_stack([mean[:, 1], np.full(len(used), drift)])
+    sigma = (sensor.sigma / np.sqrt(count))[:, None]
+    return Rows(heights.sensor, "barometer", used, used, mean[:, :1], data, sigma, slice(0, 0), count, sensor.loss)
+
+
+def velocity_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], sigma: Floats) -> Rows:
+    """Zero velocity at the keyframes inside ``intervals``; ``sigma`` (3,) m/s per axis of n."""
+    still = np.zeros(len(keyframes_s), dtype=bool)
+    for start, end in intervals:
+        still |= (keyframes_s >= start) & (keyframes_s <= end)
+    k = np.flatnonzero(still)
+    empty, zero = np.zeros((len(k), 0)), np.zeros((len(k), 3))
+    return Rows("zero_velocity", "velocity", k, k, zero, empty, zero + sigma, slice(0, 0), np.ones(len(k), dtype=int))
+
+
+def bounded_rows(keyframes_s: Floats, centre_n: Floats, radius: float, speed: float) -> Rows:
+    """A body that stays within ``radius`` of ``centre_n`` and below ``speed``, both read as one sd, at every keyframe."""
+    k = np.arange(len(keyframes_s))
+    z = np.tile(np.concatenate([centre_n, np.zeros(3)]), (len(k), 1))
+    sigma = np.tile(np.repeat([radius, speed], 3), (len(k), 1))
+    ones = np.ones(len(k), dtype=int)
+    return Rows("motion", "bounded", k, k, z, np.zeros((len(k), 0)), sigma, slice(0, 0), ones)
+
+
+def _group(k: np.ndarray, values: Floats) -> tuple[np.ndarray, Floats, np.ndarray]:
+    """Distinct keyframes, mean of ``values`` (n, m) at each, and how many."""
+    used, inverse, count = np.unique(k, return_inverse=True, return_counts=True)
+    total = np.zeros((len(used), values.shape[1]))
+    np.add.at(total, inverse, values)
+    return used, total / count[:, None], count
+
+
+def _cumulative(values: Floats) -> Floats:
+    return np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+
+
+def _interpolate(x: Floats, values: Floats, at: Floats) -> Floats:
+    """Linear interpolation of (n, ...) values."""
+    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    share = ((at - x[k]) / (x[k + 1] - x[k])).reshape(-1, *(1,) * (values.ndim - 1))
+    return values[k] + share * (values[k + 1] - values[k])

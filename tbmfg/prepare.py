@@ -1,0 +1,441 @@
+"""From a log and a rig to the problem that every estimator solves: once per log, alike for all.
+
+Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, the clock offset and the
+noise factor of the IMU, found from the log itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tbmfg import earth, measure
+from tbmfg.errors import EstimationError, LogError, RigError
+from tbmfg.filters import ins
+from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy, rotation_z, yaw_of
+from tbmfg.inertial import alignment
+from tbmfg.inertial.steps import Steps, compensate, make_steps, to_ns
+from tbmfg.inertial.strapdown import rotations
+from tbmfg.measure import GyroFrame, Samples
+from tbmfg.problem import Inertial, Parameters, Prior, Problem
+from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, Rig, kind_of
+from tbmfg.state import NAV, Calibrated, Counts, Interval
+from tbmfg.timeseries import Floats, Log, seconds
+
+Prepared = Problem
+
+VALUES = {  # column of the series that each kind of sensor measures with
+    "prism": lambda series: series["point"],
+    "odometer": lambda series: series["linear"][:, 0],
+    "magnetometer": lambda series: series["field"],
+    "barometer": lambda series: pressure_height(series["pressure"]),
+}
+SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
+UNKNOWN_YAW = np.deg2rad(90.0)  # a heading prior wider than this is no prior
+
+
+@dataclass(slots=True)
+class _Setup:
+    """What stays the same while offset and noise factor are searched."""
+
+    rig: Rig
+    steps: Steps
+    frame: GyroFrame
+    gyro: Floats
+    acc: Floats
+    samples: dict[str, Samples]
+    parameters: Parameters
+    R_start: Floats
+    yaw_sd: float
+    still: list[tuple[float, float]]
+    still_sigma: Floats
+    bias_gyro: Floats
+    origin_n: Floats
+    counts: dict[str, Counts]
+    warnings: list[str] = field(default_factory=list)
+
+
+def pressure_height(pressure: Floats) -> Floats:
+    """Height in the standard atmosphere [m] for pressure [Pa]; ISO 2533, troposphere."""
+    return 44330.77 * (1.0 - (pressure / 101325.0) ** 0.190263)
+
+
+def prepare(
+    log: Log,
+    rig: Rig,
+    *,
+    outages: tuple[tuple[str, float, float], ...] = (),
+    without: tuple[str, ...] = (),
+    progress: Callable[[str, float], None] | None = None,
+) -> Problem:
+    """Everything an estimator needs.
+
+    ``outages`` are (sensor, start, end) in s from the first IMU sample, stamps as recorded; ``without`` names sensors to
+    leave aside. Raises LogError without IMU samples, RigError for names that the rig does not have.
+    """
+    tell = progress or (lambda stage, share: None)
+    tell("prepare", 0.0)
+    for name in [sensor for sensor, _, _ in outages] + list(without):
+        if name not in rig.sensors:
+            raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
+    warnings: list[str] = list(log.damage)
+    steps, imu_counts = _imu_steps(log, rig)
+    samples, counts = _samples(log, rig, steps, outages, without, warnings)
+    counts = {"imu": imu_counts, **counts}
+    setup = _align(rig, steps, samples, counts, warnings)
+    offsets = {name: rig.sensors[name].clock_offset for name in samples if _is_position(rig, name)}
+    factor = rig.imu.noise_factor
+    problem = _search(setup, offsets, factor, tell)
+    problem.intervals = [
+        *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
+        *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
+        *(Interval("zero_velocity", "standing", *(int(t) for t in to_ns(steps, np.array(s)))) for s in setup.still),
+    ]
+    tell("prepare", 1.0)
+    return problem
+
+
+def _is_position(rig: Rig, name: str) -> bool:
+    return isinstance(rig.sensors[name], PositionSensor)
+
+
+def _imu_steps(log: Log, rig: Rig) -> tuple[Steps, Counts]:
+    name = next(name for name in rig.sensors if kind_of(name) == "imu")
+    series = log.series.get(rig.imu.topic)
+    if series is None or "gyro" not in series.columns:
+        have = ", ".join(sorted(t for t, s in log.series.items() if s.type.endswith("Imu"))) or "none"
+        raise LogError(f"{log.path}: no Imu messages on {rig.imu.topic!r}; Imu topics in the log: {have}; set sensors.imu.topic")
+    if any(rig.imu.T_bi.xyz_m):
+        raise RigError(f"sensors.{name}.T_bi.xyz_m must be zero: b has its origin at the IMU; move the other sensors' arms instead")
+    c = series.counts
+    counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
+    return make_steps(series, rig.imu.T_bi.R, rig.imu.stamp), counts
+
+
+def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Samples], dict[str, Counts]]:
+    """Usable samples by sensor, and the counts so far (used is filled in by the estimators)."""
+    samples, counts = {}, {}
+    for name, sensor in rig.sensors.items():
+        kind = kind_of(name)
+        if kind == "imu":
+            continue
+        series = log.series.get(sensor.topic)
+        if series is None:
+            warnings.append(f"{name}: no messages on {sensor.topic}; it is not used")
+            continue
+        c = series.counts
+        counts[name] = count = Counts(received=c.received, duplicate=c.duplicate, nonfinite=c.nonfinite)
+        if name in without or kind not in VALUES:
+            if name not in without:
+                warnings.append(f"{name}: no model for this kind of sensor yet; its {len(series)} messages are not used")
+            count.unused = len(series)
+            continue
+        t = seconds(series.t_ns, steps.t0_ns)
+        out = np.zeros(len(t), dtype=bool)
+        for sensor_name, start, end in outages:
+            if sensor_name == name:
+                out |= (t >= start) & (t < end)
+        offset, spread = getattr(sensor, "clock_offset", 0.0), 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
+        inside = (t - offset - spread >= steps.edges_s[0]) & (t - offset + spread <= steps.end_s)
+        count.outage = int(out.sum())
+        count.unused = int((~out & ~inside).sum())
+        keep = ~out & inside
+        if keep.sum() < 2:
+            warnings.append(f"{name}: {int(keep.sum())} of {len(t)} samples lie in the IMU span and outside outages; it is not used")
+            count.unused += int(keep.sum())
+            continue
+        samples[name] = Samples(name, t[keep], np.ascontiguousarray(VALUES[kind](series)[keep]))
+    return samples, counts
+
+
+def _parameters(rig: Rig, samples: dict[str, Samples]) -> Parameters:
+    """The constant calibrations of the sensors at hand, with the rig's priors."""
+    entries: list[tuple[str, float, float]] = []
+    for name in samples:
+        sensor = rig.sensors[name]
+        if isinstance(sensor, PositionSensor):
+            entries += [(f"{name}.arm_{axis}", sensor.arm[k], sensor.arm_sd) for k, axis in enumerate("xyz")]
+            entries += [(f"{name}.clock_offset", sensor.clock_offset, sensor.clock_offset_sd)]
+        elif isinstance(sensor, Odometer):
+            entries += [(f"{name}.scale", sensor.scale, sensor.scale_sd)]
+            entries += [(f"{name}.{axis}", getattr(sensor, axis), sensor.mounting_sd) for axis in ("yaw", "pitch")]
+        elif isinstance(sensor, Magnetometer):
+            entries += [(f"{name}.declination", sensor.declination, sensor.declination_sd)]
+    names, mean, sd = zip(*entries, strict=True) if entries else ((), (), ())
+    return Parameters(tuple(names), np.array(mean, float), np.array(sd, float), np.array(mean, float))
+
+
+def _align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> _Setup:
+    """Initial attitude, gyro bias, and where the machine stands."""
+    still = alignment.still_intervals(steps)
+    bias_gyro = np.zeros(3)
+    # a tight bias prior must not swallow the Earth rate that a good gyro would find north with
+    if still and rig.imu.gyro_bias_sd > 5.0 * earth.RATE:
+        longest = max(still, key=lambda s: s[1] - s[0])
+        bias_gyro = steps.gyro[alignment.rows_between(steps, *longest)].mean(axis=0)
+    gyro, acc = compensate(steps, bias_gyro, np.zeros(3))
+    R_0t = rotations(steps.edges_s, gyro, bias_gyro)
+    frame = GyroFrame(steps, R_0t, gyro - bias_gyro, bias_gyro)
+    R_level = alignment.level_at_start(steps, R_0t, still)
+
+    start = rig.initial
+    R_level = _with_given_tilt(R_level, start.roll, start.pitch)
+    position = next((s for name, s in samples.items() if _is_position(rig, name)), None)
+    R_start, yaw_sd = R_level, start.yaw_sd
+    if start.yaw is not None:
+        R_start = rotation_z(start.yaw - float(yaw_of(R_level))) @ R_level
+    elif (found := _magnetic_heading(rig, samples, frame, R_level)) is not None:
+        R_start, yaw_sd = rotation_z(found) @ R_level, min(yaw_sd, np.deg2rad(10.0))
+    elif position is not None:
+        sensor = rig.sensors[position.sensor]
+        spread = 3.0 * sensor.clock_offset_sd
+        offsets = sensor.clock_offset + (np.arange(-spread, spread + 1e-9, 0.02) if spread else np.zeros(1))
+        fit = alignment.fit_motion(
+            steps, bias_gyro, R_level, position.t_s, position.values, offsets, rig.origin.gravity
+        )
+        if fit is None:
+            warnings.append("heading is not observable: no stretch of 8 s has motion that turns it into a heading; set initial.yaw_deg")
+        else:
+            R_start, yaw_sd = rotation_z(fit.heading) @ R_level, max(2.0 * fit.heading_sd, np.deg2rad(5.0))
+    else:
+        warnings.append("heading is a guess: no magnetometer, no position sensor, no initial.yaw_deg; it is set to 0")
+
+    confirmed = _confirmed_rest(rig, samples, still) if rig.zero_velocity.enabled else []
+    sigma = np.hypot(rig.zero_velocity.sigma, _vibration_speed(steps, confirmed))
+    origin_n = np.round(np.median(position.values[:50], axis=0)) if position is not None else np.zeros(3)
+    return _Setup(
+        rig, steps, frame, gyro, acc, samples, _parameters(rig, samples), R_start, yaw_sd, confirmed,
+        np.full(3, sigma), bias_gyro, origin_n, counts, warnings,
+    )  # fmt: skip
+
+
+def _with_given_tilt(R_level: Floats, roll: float | None, pitch: float | None) -> Floats:
+    """The levelled start attitude with roll and pitch from the rig, where it gives them."""
+    if roll is None and pitch is None:
+        return R_level
+    found = np.array([np.arctan2(R_level[2, 1], R_level[2, 2]), -np.arcsin(np.clip(R_level[2, 0], -1, 1)), yaw_of(R_level)])
+    given = np.array([found[0] if roll is None else roll, found[1] if pitch is None else pitch, found[2]])
+    return rotation_from_rpy(given)
+
+
+def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_level: Floats) -> float | None:
+    """Turn about the vertical from the levelled start frame to n by the first ten seconds of magnetometer, or None."""
+    for name, s in samples.items():
+        sensor = rig.sensors[name]
+        if isinstance(sensor, Magnetometer):
+            rows = s.t_s < s.t_s[0] + 10.0
+            b = (s.values[rows] - sensor.hard_iron) @ sensor.R_bm.T
+            h = np.einsum("nij,nj->ni", frame.at(s.t_s[rows] - sensor.clock_offset), b).mean(axis=0) @ R_level.T
+            north = earth.north_direction(rig.origin.x_axis_azimuth) - sensor.declination
+            return float(north - np.arctan2(h[1], h[0]))
+    return None
+
+
+def _confirmed_rest(rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
+    confirmed = []
+    for start, end in still:
+        for name, s in samples.items():
+            sensor = rig.sensors[name]
+            t = s.t_s - getattr(sensor, "clock_offset", 0.0)
+            rows = (t >= start) & (t <= end)
+            if rows.sum() < 3:
+                continue
+            values = s.values[rows]
+            if isinstance(sensor, PositionSensor):
+                spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
+                resting = bool(np.all(spread < 5.0 * sensor.sigma_at(values)))
+            elif isinstance(sensor, Odometer):
+                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
+            else:
+                continue
+            # the stamps' offset may be unknown: leave its spread free on either side
+            margin = 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
+            first, last = float(t[rows][0]) + margin, float(t[rows][-1]) - margin
+            if resting and last > first:
+                confirmed.append((first, last))
+            break
+    return confirmed
+
+
+def _vibration_speed(steps: Steps, intervals: list[tuple[float, float]]) -> float:
+    """RMS of the vibration's velocity per axis [m/s] while standing: what a zero velocity must allow for."""
+    squares = []
+    for start, end in intervals:
+        rows = alignment.rows_between(steps, start, min(end, start + 10.0))
+        force = steps.acc[rows]
+        if len(force) < 10:
+            continue
+        v = np.cumsum((force - force.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
+        # drift of the mean over a second is no vibration
+        size = max(1, round(1.0 / steps.period_s))
+        smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
+        squares.append(np.mean((v - smooth)[size:-size] ** 2) if len(v) > 3 * size else np.mean((v - smooth) ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def _build(setup: _Setup, offsets: dict[str, float], factor: float, end_s: float | None = None) -> Problem:
+    """The problem for given clock offsets and noise factor, up to ``end_s``."""
+    rig, steps = setup.rig, setup.steps
+    end_s = steps.end_s if end_s is None else min(end_s, steps.end_s)
+    samples = {
+        name: Samples(name, s.t_s[rows], s.values[rows])
+        for name, s in setup.samples.items()
+        if (rows := s.t_s - offsets.get(name, 0.0) <= end_s).sum() >= 2
+    }
+    mean, begin = setup.parameters.mean.copy(), setup.parameters.mean.copy()
+    for name, offset in offsets.items():
+        k = setup.parameters.names.index(f"{name}.clock_offset")
+        mean[k], begin[k] = mean[k] - offset, 0.0
+    parameters = replace(setup.parameters, mean=mean, start=begin)
+
+    fixes = [s.t_s - offsets[name] for name, s in samples.items() if _is_position(rig, name)]
+    keyframes = measure.keyframe_times(
+        rig.keyframes, float(steps.edges_s[0]), end_s, np.sort(np.concatenate(fixes)) if fixes else np.zeros(0)
+    )
+    rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
+    for name, s in samples.items():
+        sensor, calib = rig.sensors[name], parameters.slice(name)
+        if isinstance(sensor, PositionSensor):
+            rows.append(measure.position_rows(sensor, s, offsets[name], keyframes, setup.frame, setup.origin_n, calib))
+        elif isinstance(sensor, Odometer):
+            rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
+        elif isinstance(sensor, Magnetometer):
+            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, rig.origin.x_axis_azimuth, calib))
+        elif isinstance(sensor, Barometer):
+            rows.append(measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names)))
+            drift_names.append(f"{name}.bias")
+            drift_walk.append(sensor.bias_walk)
+            drift_sd.append(max(sensor.bias_sd, 1e-6))
+            drift_start.append(float(np.median(s.values[:20])))
+    if setup.still:
+        rows.append(measure.velocity_rows(keyframes, setup.still, setup.still_sigma))
+    position, velocity = _start(setup, offsets)
+    if rig.motion is not None:
+        rows.append(measure.bounded_rows(keyframes, position, rig.motion.radius, rig.motion.speed))
+    if not any(kind_of(r.sensor) != "zero_velocity" for r in rows):
+        raise EstimationError(
+            "nothing but the IMU to go by: no prism, odometer, magnetometer or barometer in the log and no motion bound in the rig"
+        )
+
+    imu = rig.imu
+    inertial = Inertial(
+        steps, setup.gyro, setup.acc,
+        (factor * imu.gyro_density) ** 2 + steps.extra_gyro, (factor * imu.acc_density) ** 2 + steps.extra_acc,
+        imu.gyro_walk**2, imu.acc_walk**2, rig.origin.rate_n, np.array([0.0, 0.0, -rig.origin.gravity]),
+    )  # fmt: skip
+    drift = np.array(drift_start) - setup.origin_n[2] - position[2] if drift_names else np.zeros(0)
+    x = np.concatenate([setup.R_start.ravel(), position, velocity, np.zeros(3), setup.bias_gyro, drift])
+    prior = _prior(setup, x, np.array(drift_sd), bool(fixes))
+    return Problem(
+        rig, inertial, keyframes, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
+        dict(offsets), setup.counts, {}, [], setup.warnings,
+    )  # fmt: skip
+
+
+def _start(setup: _Setup, offsets: dict[str, float]) -> tuple[Floats, Floats]:
+    """Position (relative to the origin) and velocity in n at the first edge: from the rig, else from the first fixes."""
+    rig = setup.rig
+    position, velocity = rig.initial.position, rig.initial.velocity
+    for name, s in setup.samples.items():
+        if not _is_position(rig, name):
+            continue
+        t = s.t_s - offsets[name] - setup.steps.edges_s[0]
+        rows = t < t[0] + 2.0
+        degree = 1 if rows.sum() >= 5 and t[0] < 1.0 else 0
+        fit = np.polynomial.polynomial.polyfit(t[rows], s.values[rows], degree)
+        position = fit[0] - setup.R_start @ rig.sensors[name].arm if position is None else position
+        velocity = fit[1] if velocity is None and degree else velocity
+        break
+    position = np.zeros(3) if position is None else position - setup.origin_n
+    return position, np.zeros(3) if velocity is None else velocity
+
+
+def _prior(setup: _Setup, x: Floats, drift_sd: Floats, has_fixes: bool) -> Prior:
+    """Covariance of the first state; attitude sds are about n's axes and turned into b."""
+    rig = setup.rig
+    start, R = rig.initial, x[:9].reshape(3, 3)
+
+    def covariance(yaw_sd: float) -> Floats:
+        sd_n = np.array([start.tilt_sd, start.tilt_sd, yaw_sd])
+        cov = np.zeros((NAV + len(drift_sd), NAV + len(drift_sd)))
+        cov[:3, :3] = R.T @ np.diag(sd_n**2) @ R
+        # without a given position the first fix is it: the prior must then not compete with the fixes
+        position_sd = start.position_sd if start.position is not None or not has_fixes else max(start.position_sd, 10.0)
+        sd = np.repeat([position_sd, start.velocity_sd, rig.imu.acc_bias_sd, rig.imu.gyro_bias_sd], 3)
+        cov[3:, 3:] = np.diag(np.concatenate([sd, drift_sd]) ** 2)
+        return cov
+
+    return Prior(x, covariance(start.yaw_sd), covariance(setup.yaw_sd))
+
+
+def _search(setup: _Setup, offsets: dict[str, float], factor, tell: Callable[[str, float], None]) -> Problem:
+    """Clock offsets and noise factor from the log, alternating, then the problem at what was found.
+
+    A constant's last estimate by a filter holds all that the log says about it, so the offsets are states of ``ins``;
+    keyframes move with them until they stand. The factor minimises the filter's likelihood cost.
+    """
+    auto = factor == "auto"
+    value, sd = (1.0 if auto else float(factor)), 0.0
+    names = setup.parameters.names
+    unknown = [n for n in offsets if setup.parameters.sd[names.index(f"{n}.clock_offset")] > 0]
+    for name in unknown:
+        offsets[name] = _coarse_offset(setup, name)
+    for turn in range(3 if auto and unknown else 1):
+        if auto:
+            value, sd = _noise_factor(setup, offsets, start=value if turn else None)
+            tell("prepare", 0.2 + 0.2 * turn)
+        moved = 0.0
+        for _ in range(4 if unknown else 0):
+            filtered = ins.run(_build(setup, offsets, value, SEARCH_S))
+            moved = 0.0
+            for name in unknown:
+                step = float(filtered.c[names.index(f"{name}.clock_offset")])
+                offsets[name] += step
+                moved = max(moved, abs(step))
+            if moved < 1e-4:
+                break
+        if moved < 1e-4 and turn:
+            break
+    problem = _build(setup, offsets, value)
+    problem.calibration["noise_factor"] = Calibrated(value, sd, auto)
+    return problem
+
+
+def _coarse_offset(setup: _Setup, name: str) -> float:
+    """Clock offset by fitting the sensor's motion to the inertial one over three sd of the prior."""
+    sensor, s = setup.rig.sensors[name], setup.samples[name]
+    spread = 3.0 * sensor.clock_offset_sd
+    grid = sensor.clock_offset + np.linspace(-spread, spread, 2 * max(2, int(np.ceil(spread / 0.02))) + 1)
+    R_level = setup.R_start
+    fit = alignment.fit_motion(
+        setup.steps, setup.bias_gyro, R_level, s.t_s, s.values, grid, setup.rig.origin.gravity
+    )
+    if fit is None:
+        setup.warnings.append(f"{name}: clock offset not observable: the machine hardly moved; it stays at the rig's value")
+        return sensor.clock_offset
+    return fit.clock_offset_s
+
+
+def _noise_factor(setup: _Setup, offsets: dict[str, float], start: float | None) -> tuple[float, float]:
+    """Noise factor that minimises the cost of ``ins``, and its sd from the curvature: -2 log likelihood in log factor."""
+    costs: dict[float, float] = {}
+
+    def cost(log2: float) -> float:
+        if log2 not in costs:
+            costs[log2] = ins.run(_build(setup, offsets, 2.0**log2, SEARCH_S), fixed=("clock_offset",)).cost
+        return costs[log2]
+
+    grid = [float(k) for k in range(-1, 7)] if start is None else [round(np.log2(start)) + k for k in (-1.0, 0.0, 1.0)]
+    best = min(grid, key=cost)
+    while (lower := min((best - 1.0, best + 1.0), key=cost)) and cost(lower) < cost(best):
+        best = lower
+    a, b, c = (cost(best + k) for k in (-0.5, 0.0, 0.5))
+    curvature = (a - 2 * b + c) / 0.25
+    if curvature <= 0:
+        return 2.0**best, 0.0
+    vertex = best + 0.25 * (a - c) / (a - 2 * b + c)
+    factor = 2.0 ** float(np.clip(vertex, best - 1, best + 1))
+    return factor, factor * float(np.sqrt(2.0 / curvature)) * np.log(2.0)

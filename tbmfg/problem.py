@@ -1,0 +1,108 @@
+"""The estimation problem that one log and one rig make: what every estimator is given, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tbmfg.inertial.steps import Steps, to_ns
+from tbmfg.rig import Rig
+from tbmfg.sensors import Rows
+from tbmfg.state import NAV, Calibrated, Counts, Interval
+from tbmfg.timeseries import Floats, Times
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Constant calibrations side by side in one vector: names such as ``prism.arm_x``, prior mean and sd (0: known).
+
+    ``start`` is where an estimator begins: the mean, but for clock offsets, which are counted from the offset that
+    the keyframes were placed with. A filter takes it for the mean.
+    """
+
+    names: tuple[str, ...]
+    mean: Floats
+    sd: Floats
+    start: Floats
+
+    @property
+    def free(self) -> np.ndarray:
+        """Indices of those that are estimated."""
+        return np.flatnonzero(self.sd > 0)
+
+    def slice(self, sensor: str) -> slice:
+        """Where the calibrations of ``sensor`` lie."""
+        own = [k for k, name in enumerate(self.names) if name.rpartition(".")[0] == sensor]
+        return slice(own[0], own[-1] + 1) if own else slice(0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Inertial:
+    """Compensated steps with their noise, and the field they are integrated in.
+
+    ``gyro`` and ``acc`` (n, 3) in b; ``psd_gyro``, ``psd_acc`` (n,) white noise [unit^2/Hz];
+    ``psd_bg``, ``psd_ba`` bias random walks; ``earth_n`` rad/s, ``gravity_n`` m/s^2, (3,).
+    """
+
+    steps: Steps
+    gyro: Floats
+    acc: Floats
+    psd_gyro: Floats
+    psd_acc: Floats
+    psd_bg: float
+    psd_ba: float
+    earth_n: Floats
+    gravity_n: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """First state (21 + e,) and covariance (15 + e, 15 + e) of its error.
+
+    ``filter_cov`` is what a filter must start from: the same, unless the rig does not know the heading. Then
+    the heading was found from the log, and a filter, which linearises once, takes its sd from there.
+    """
+
+    x: Floats
+    cov: Floats
+    filter_cov: Floats
+
+
+@dataclass(slots=True)
+class Problem:
+    """See the fields. Positions are relative to ``origin_n``, times in s since ``steps.t0_ns``.
+
+    ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
+    ``clock_offset_s`` the offsets that the rows were placed with.
+    """
+
+    rig: Rig
+    inertial: Inertial
+    keyframes_s: Floats
+    rows: list[Rows]
+    parameters: Parameters
+    drift_names: tuple[str, ...]
+    drift_walk: Floats
+    prior: Prior
+    origin_n: Floats
+    clock_offset_s: dict[str, float]
+    counts: dict[str, Counts] = field(default_factory=dict)
+    calibration: dict[str, Calibrated] = field(default_factory=dict)
+    intervals: list[Interval] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def t0_ns(self) -> int:
+        """Stamp of the first IMU sample: the zero of all seconds."""
+        return self.inertial.steps.t0_ns
+
+    @property
+    def t_ns(self) -> Times:
+        """Stamps of the keyframes, (n,)."""
+        return to_ns(self.inertial.steps, self.keyframes_s)
+
+    @property
+    def size(self) -> int:
+        """Dimension of one keyframe's error state."""
+        return NAV + len(self.drift_walk)
