@@ -9,9 +9,6 @@ A problem with a rig is a :class:`~tbmfg.errors.RigError` of one line per fault:
 
 from __future__ import annotations
 
-import difflib
-import json
-import math
 import re
 from collections.abc import Callable, Iterable
 from importlib import resources
@@ -20,89 +17,37 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainValidator,
-    SerializeAsAny,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, field_validator, model_validator
 
 from tbmfg import earth, yamltext
 from tbmfg.errors import RigError
+from tbmfg.fields import (
+    DEG,
+    MICRO_G,
+    MICRO_TESLA,
+    MM,
+    PPM,
+    STANDARD_GRAVITY,
+    ZERO,
+    CalibrationSd,
+    Flag,
+    Loss,
+    Moment,
+    Node,
+    NoiseFactor,
+    NotNegative,
+    Number,
+    Positive,
+    Text,
+    Triple,
+    explain,
+    fault,
+    near,
+    or_raise,
+    si,
+)
 from tbmfg.timeseries import Floats
 from tbmfg.yamltext import KeyPath, dotted
-
-STANDARD_GRAVITY = 9.80665  # m/s^2; used where the latitude is not given
-
-DEG = math.pi / 180
-MM, PPM, MICRO_G, MICRO_TESLA = 1e-3, 1e-6, 1e-6 * STANDARD_GRAVITY, 1e-6
-
-
-# ---- value types: strict, so that neither "3" nor true passes for a number ----
-
-
-def _triple(value: Any) -> Any:
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise PydanticCustomError("triple", "should be three numbers [x, y, z]")
-    return value
-
-
-def _noise_factor(value: Any) -> float | Literal["auto"]:
-    if value == "auto":
-        return value
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf:
-        return float(value)
-    raise PydanticCustomError("noise_factor", "should be auto or a number greater than 0")
-
-
-def _moment(value: Any) -> float | Literal["start", "end"]:
-    if value in ("start", "end"):
-        return value
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
-        return float(value)
-    raise PydanticCustomError("moment", "should be start, end or seconds from the first IMU sample")
-
-
-_strict = Field(strict=True, allow_inf_nan=False)
-Number = Annotated[float, _strict]
-Positive = Annotated[float, _strict, Field(gt=0)]
-NotNegative = Annotated[float, _strict, Field(ge=0)]
-CalibrationSd = Annotated[
-    float, BeforeValidator(lambda value: 0.0 if value is None else value), _strict, Field(ge=0)
-]  # 0 or null: not estimated
-Triple = Annotated[tuple[Number, Number, Number], BeforeValidator(_triple)]
-Flag = Annotated[bool, Field(strict=True)]
-Topic = Annotated[str, Field(strict=True, min_length=1)]
-NoiseFactor = Annotated[float | Literal["auto"], PlainValidator(_noise_factor)]
-Moment = Annotated[float | Literal["start", "end"], PlainValidator(_moment)]
-Loss = Literal["none", "huber", "cauchy"]
-
-ZERO = (0.0, 0.0, 0.0)
-
-
-def si(field: str, unit: float = 1.0) -> property:
-    """``field`` in SI: a float, a triple as (3,), None where it is null."""
-
-    def value(self: Node) -> Any:
-        given = getattr(self, field)
-        if given is None:
-            return None
-        return np.array(given) * unit if isinstance(given, tuple) else given * unit
-
-    return property(value, doc=f"``{field}`` in SI.")
-
-
-class Node(BaseModel):
-    """A mapping of the rig file: frozen, unknown keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
 
 # ---- where and how the machine starts ----
 
@@ -110,7 +55,7 @@ class Node(BaseModel):
 class Origin(Node):
     """Where the navigation frame lies on Earth and how it is turned."""
 
-    latitude_deg: Annotated[float, _strict, Field(ge=-90, le=90)] | None = Field(
+    latitude_deg: Annotated[Number, Field(ge=-90, le=90)] | None = Field(
         None, description="Geodetic latitude; null: no Earth rate is modelled and gravity is the standard one."
     )
     height_m: Number = Field(0.0, description="Height above the ellipsoid, for gravity; 1 km changes it by 0.03 %.")
@@ -193,7 +138,7 @@ def _rotation(rpy_deg: tuple[float, float, float]) -> Floats:
 class Sensor(Node):
     """What every sensor has: the topic it is recorded under."""
 
-    topic: Topic = Field(description="Topic in the log.")
+    topic: Text = Field(description="Topic in the log.")
 
 
 class Imu(Sensor):
@@ -274,7 +219,7 @@ class Odometer(Sensor):
     lateral_sigma_mps: Positive = Field(
         0.02, description="Of the assumption that the contact point neither slides sideways nor lifts, per sample."
     )
-    scale: Annotated[float, _strict, Field(gt=-1)] = Field(0.0, description="Scale error, dimensionless.")
+    scale: Annotated[Number, Field(gt=-1)] = Field(0.0, description="Scale error, dimensionless.")
     scale_sd: CalibrationSd = Field(0.0, description="0 or null: the scale is not estimated.")
     arm_m: Triple = Field(ZERO, description="From the IMU to the contact point, in b.")
     yaw_deg: Number = Field(0.0, description="Forward axis of the odometer in b: rotation about z.")
@@ -387,7 +332,7 @@ class Motion(Node):
 class TruthTopic(Node):
     """Where the log holds reference poses. They are compared with, never used."""
 
-    topic: Topic = Field(description="Odometry or PoseStamped topic.")
+    topic: Text = Field(description="Odometry or PoseStamped topic.")
 
 
 class SurveyPoint(Node):
@@ -404,7 +349,7 @@ class SurveyPoint(Node):
 class Rig(Node):
     """One machine and the log it writes. Everything but the topics has a default."""
 
-    name: Annotated[str, Field(strict=True, min_length=1)] = Field("rig", description="Shown in reports.")
+    name: Text = Field("rig", description="Shown in reports.")
     origin: Origin = Field(Origin(), description="Place and orientation of n.")
     initial: Initial = Field(Initial(), description="Prior of the first state.")
     keyframes: Keyframes = Field(Keyframes(), description="When the estimators hold a state.")
@@ -447,19 +392,19 @@ class Rig(Node):
         for name, fields in given.items():
             kind = KINDS.get(kind_of(name))
             if kind is None:
-                hint = _near(kind_of(name), KINDS) or f"; there are {', '.join(KINDS)}"
-                faults.append(_fault((name,), f"no such kind of sensor{hint}"))
+                hint = near(kind_of(name), KINDS) or f"; there are {', '.join(KINDS)}"
+                faults.append(fault((name,), f"no such kind of sensor{hint}"))
                 continue
             if not re.fullmatch(r"\w+(-\w+)*", name):
-                faults.append(_fault((name,), "a sensor's name is its kind, then -words of letters and digits"))
+                faults.append(fault((name,), "a sensor's name is its kind, then -words of letters and digits"))
                 continue
             try:
                 sensors[name] = kind.model_validate(fields)
             except ValidationError as error:
                 faults += [
-                    _fault((name, *e["loc"]), e["msg"], e["input"], e["type"]) for e in error.errors(include_url=False)
+                    fault((name, *e["loc"]), e["msg"], e["input"], e["type"]) for e in error.errors(include_url=False)
                 ]
-        return _or_raise(sensors, faults)
+        return or_raise(sensors, faults)
 
     @model_validator(mode="after")
     def _consistent(self) -> Rig:
@@ -467,15 +412,18 @@ class Rig(Node):
         faults = []
         if list(self.of_kind("imu")) != ["imu"]:
             holds = f", not {', '.join(self.sensors)}" if self.sensors else ""
-            faults.append(_fault(("sensors",), f"should hold one IMU, called imu{holds}"))
+            return or_raise(self, [fault(("sensors",), f"should hold one IMU, called imu{holds}")])
+        if any(self.imu.T_bi.xyz_m):
+            reason = "should be zero, b has its origin at the IMU; move the other sensors' arms instead"
+            faults.append(fault(("sensors", "imu", "T_bi", "xyz_m"), reason))
         first_with: dict[str, str] = {}
         for name, sensor in self.sensors.items():
             other = first_with.setdefault(sensor.topic, name)
             if other != name:
-                faults.append(_fault(("sensors", name, "topic"), f"{sensor.topic} is already the topic of {other}"))
+                faults.append(fault(("sensors", name, "topic"), f"{sensor.topic} is already the topic of {other}"))
         if (self.initial.roll_deg is None) != (self.initial.pitch_deg is None):
-            faults.append(_fault(("initial",), "roll_deg and pitch_deg should be given together or not at all"))
-        return _or_raise(self, faults)
+            faults.append(fault(("initial",), "roll_deg and pitch_deg should be given together or not at all"))
+        return or_raise(self, faults)
 
 
 # ---- reading ----
@@ -495,7 +443,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
         return parse_rig(Path(given).read_text("utf-8-sig"), given)
     except FileNotFoundError:
         known = shipped()
-        hint = _near(given, known) or f"; shipped are {', '.join(known)}"
+        hint = near(given, known) or f"; shipped are {', '.join(known)}"
         raise RigError(f"{given}: neither a file nor a shipped rig{hint}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise RigError(f"{given}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from error
@@ -547,7 +495,7 @@ def _assign(data: Any, path: tuple[str, ...], value: Any, source: str) -> KeyPat
         elif not isinstance(data, dict):
             raise RigError(f"{source}: {dotted(tuple(done))} is a value, not a mapping")
         elif key not in data and not last and path[0] != "estimators":
-            raise RigError(f"{source}: {dotted((*done, key))}: no such key{_near(key, data)}")
+            raise RigError(f"{source}: {dotted((*done, key))}: no such key{near(key, data)}")
         done.append(key)
         if last:
             data[key] = value
@@ -571,37 +519,8 @@ def _validated(data: Any, where: Callable[[KeyPath], tuple]) -> Rig:
     try:
         return Rig.model_validate(data)
     except ValidationError as error:
-        faults = sorted((where(e["loc"]), _explain(e)) for e in error.errors(include_url=False))
+        faults = sorted((where(e["loc"]), explain(e, _keys_beside)) for e in error.errors(include_url=False))
     raise RigError("\n".join(f"{':'.join(map(str, place))}: {reason}" for place, reason in faults))
-
-
-# ---- messages ----
-
-OURS = "rig"  # type of the faults that say their values themselves
-
-
-def _fault(path: KeyPath, reason: str, value: Any = None, kind: str = OURS) -> InitErrorDetails:
-    return InitErrorDetails(type=PydanticCustomError(kind, reason), loc=path, input=value)
-
-
-def _or_raise(value: Any, faults: list[InitErrorDetails]) -> Any:
-    if faults:
-        raise ValidationError.from_exception_data("rig", faults)
-    return value
-
-
-def _explain(error: Any) -> str:
-    """``key.path: reason, got value`` of one pydantic error."""
-    path, value = error["loc"], error["input"]
-    if error["type"] == "extra_forbidden":
-        return f"{dotted(path)}: unknown key{_near(str(path[-1]), _keys_beside(path))}"
-    if error["type"] == "missing":
-        return f"{dotted(path)}: is required"
-    if error["type"] in ("model_type", "dict_type"):
-        reason = "should be a mapping"
-    else:
-        reason = error["msg"].removeprefix("Input ")
-    return f"{dotted(path)}: {reason}" + ("" if error["type"] == OURS else f", got {_shown(value)}")
 
 
 def _keys_beside(path: KeyPath) -> Iterable[str]:
@@ -614,13 +533,3 @@ def _keys_beside(path: KeyPath) -> Iterable[str]:
         annotation = model.model_fields[key].annotation
         model = next(a for a in (annotation, *get_args(annotation)) if isclass(a) and issubclass(a, Node))
     return model.model_fields
-
-
-def _near(word: str, known: Iterable[str]) -> str:
-    matches = difflib.get_close_matches(word, list(known), n=2)
-    return f"; did you mean {' or '.join(matches)}?" if matches else ""
-
-
-def _shown(value: Any) -> str:
-    text = json.dumps(value, default=repr, ensure_ascii=False)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -154,6 +154,11 @@ def test_unknown_name_is_refused_with_what_there_is(tmp_path):
             "sensors: {imu: {topic: /imu, T_bi: {xyz: [0, 0, 0]}}}",
             "rig.yaml:1: sensors.imu.T_bi.xyz: unknown key; did you mean xyz_m?",
         ),
+        (
+            "sensors: {imu: {topic: /imu, T_bi: {xyz_m: [0, 0, 1]}}}",
+            "rig.yaml:1: sensors.imu.T_bi.xyz_m: should be zero, b has its origin at the IMU; "
+            "move the other sensors' arms instead",
+        ),
         ("a: [1", "rig.yaml:1: not valid YAML: expected ',' or ']', but got '<stream end>'"),
         ("a: &x 1\nb: *x", "rig.yaml:2: not valid YAML: aliases are not read"),
         ("a: \x00", "rig.yaml: not valid YAML: special characters are not allowed"),
