@@ -4,17 +4,54 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tbmfg.mcap.cdr import CdrReader, CdrWriter
-from tbmfg.mcap.container import Place, PlaceReader
+from tbmfg.mcap.container import McapFile
 from tbmfg.timeseries import StreamCounts, Times
 
 TYPE = "sensor_msgs/msg/PointCloud2"
 _DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _CODES = {code: number for number, code in _DTYPES.items()}
+
+
+class Place(NamedTuple):
+    """Where one message lies: bytes ``start`` to ``stop`` of the chunk at byte ``chunk``, or of the file (-1)."""
+
+    path: str
+    chunk: int
+    start: int
+    stop: int
+
+
+class PlaceReader:
+    """Reads single messages again; keeps the last chunk, since neighbours come from the same one."""
+
+    def __init__(self) -> None:
+        self._file: McapFile | None = None
+        self._key: tuple[str, int] = ("", -1)
+        self._data = b""
+
+    def __enter__(self) -> PlaceReader:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._file:
+            self._file.__exit__(kind, error, trace)
+
+    def __call__(self, place: Place) -> memoryview:
+        if self._file is None or self._file.path != place.path:
+            self.__exit__(None, None, None)
+            self._file, self._key = McapFile(place.path), ("", -1)
+        if place.chunk < 0:
+            return memoryview(self._file.load(place.start, place.stop))
+        if self._key != (place.path, place.chunk):
+            self._key, self._data = (place.path, place.chunk), self._file.load_chunk(place.chunk)
+        return memoryview(self._data)[place.start : place.stop]
 
 
 @dataclass(frozen=True, slots=True)

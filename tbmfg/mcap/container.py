@@ -46,15 +46,6 @@ class Block(NamedTuple):
     whole: bool = True
 
 
-class Place(NamedTuple):
-    """Where one message lies: bytes ``start`` to ``stop`` of the chunk at byte ``chunk``, or of the file (-1)."""
-
-    path: str
-    chunk: int
-    start: int
-    stop: int
-
-
 class McapFile:
     """One MCAP file, read from front to back.
 
@@ -252,32 +243,6 @@ class McapFile:
             self.damage.append(f"{self.name}: attachment {attachment.name} ({length} bytes) skipped: checksum differs")
         else:
             self.attachments[attachment.name] = attachment.data
-
-
-class PlaceReader:
-    """Reads single messages again; keeps the last chunk, since neighbours come from the same one."""
-
-    def __init__(self) -> None:
-        self._file: McapFile | None = None
-        self._key: tuple[str, int] = ("", -1)
-        self._data = b""
-
-    def __enter__(self) -> PlaceReader:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._file:
-            self._file.__exit__(kind, error, trace)
-
-    def __call__(self, place: Place) -> memoryview:
-        if self._file is None or self._file.path != place.path:
-            self.__exit__(None, None, None)
-            self._file, self._key = McapFile(place.path), ("", -1)
-        if place.chunk < 0:
-            return memoryview(self._file.load(place.start, place.stop))
-        if self._key != (place.path, place.chunk):
-            self._key, self._data = (place.path, place.chunk), self._file.load_chunk(place.chunk)
-        return memoryview(self._data)[place.start : place.stop]
 
 
 def _stream(body: bytes) -> ReadDataStream:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -167,7 +167,7 @@ def _fill(messages: NDArray, rows: NDArray, t_ns: Times, columns: dict[str, Floa
         columns["quat_xyzw"][rows[messages["_orientation_cov"][:, 0] == -1.0]] = np.nan
 
 
-def encode(layout: Layout, t_ns: Times, columns: dict[str, Floats], strings: dict[str, str]) -> list[bytes]:
+def encode(layout: Layout, t_ns: Times, columns: Mapping[str, Floats], strings: Mapping[str, str]) -> list[bytes]:
     """Little-endian CDR messages from columns; columns that are not given are zero, unknown ones ignored."""
     texts = {f.name: strings.get(f.name, "").encode() + b"\0" for f in layout.fields if f.kind == "str"}
     template = _blank(layout, texts)

@@ -10,8 +10,8 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from tbmfg.mcap.clouds import McapClouds, decode_cloud
-from tbmfg.mcap.container import Block, Place
+from tbmfg.mcap.clouds import McapClouds, Place, decode_cloud
+from tbmfg.mcap.container import Block
 from tbmfg.mcap.layouts import Layout, Rows, decode
 from tbmfg.mcap.schemas import definition
 from tbmfg.timeseries import Floats, Series, StreamCounts, Times, Transform
@@ -58,7 +58,7 @@ class SeriesStream(Stream):
         super().take(block, path, entries)
         data = block.data
         self._payloads += [data[start:stop] for _, start, stop in entries]
-        self._waiting += sum(stop - start for _, start, stop in entries)
+        self._waiting += entries[-1][2] - entries[0][1]  # at most: other topics may lie in between
         if self._waiting > _BATCH_BYTES:
             self._decode()
 

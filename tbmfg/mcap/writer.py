@@ -17,10 +17,10 @@ from mcap.writer import Writer as Container
 from tbmfg.errors import LogError
 from tbmfg.mcap import clouds as cloud_messages
 from tbmfg.mcap.cdr import CdrWriter
-from tbmfg.mcap.layouts import LAYOUTS, encode
+from tbmfg.mcap.layouts import LAYOUTS, Layout, encode
 from tbmfg.mcap.schemas import definition
 from tbmfg.mcap.streams import TRANSFORMS
-from tbmfg.timeseries import Clouds, Series, Times, Transform
+from tbmfg.timeseries import Clouds, Floats, Series, Times, Transform
 
 Compression = Literal["zstd", "lz4", "none"]
 Message = tuple[int, str, bytes]  # log time, topic, CDR payload
@@ -72,7 +72,9 @@ def write_log(
         if one.type not in LAYOUTS:
             raise LogError(f"{one.topic}: {one.type} cannot be written; known types: {', '.join(sorted(LAYOUTS))}")
         types[one.topic] = one.type
-        streams.append(_series_messages(one, log_ns.get(one.topic, one.t_ns)))
+        strings = {"frame_id": one.frame_id, "child_frame_id": one.child_frame_id}
+        logged_ns = log_ns.get(one.topic, one.t_ns)
+        streams.append(encoded(one.topic, LAYOUTS[one.type], one.t_ns, logged_ns, one.columns, strings))
     for scans in clouds:
         types[scans.topic] = cloud_messages.TYPE
         streams.append(_cloud_messages(scans, log_ns.get(scans.topic, scans.t_ns)))
@@ -127,6 +129,18 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def encoded(
+    topic: str, layout: Layout, t_ns: Times, log_ns: Times, columns: Mapping[str, Floats], strings: Mapping[str, str]
+) -> Iterator[Message]:
+    """Messages of a fixed layout in the order of their log times, encoded some thousand at a time."""
+    order = np.argsort(log_ns, kind="stable")
+    for first in range(0, len(order), _BATCH):
+        rows = order[first : first + _BATCH]
+        payloads = encode(layout, t_ns[rows], {name: values[rows] for name, values in columns.items()}, strings)
+        for logged_ns, payload in zip(log_ns[rows].tolist(), payloads, strict=True):
+            yield logged_ns, topic, payload
+
+
 def encode_transforms(t_ns: int, transforms: Iterable[Transform]) -> bytes:
     """A tf2_msgs/TFMessage."""
     transforms = tuple(transforms)
@@ -134,17 +148,6 @@ def encode_transforms(t_ns: int, transforms: Iterable[Transform]) -> bytes:
     for one in transforms:
         cdr.header(t_ns, one.parent).string(one.child).scalars("d", *one.xyz, *one.quat_xyzw)
     return cdr.message()
-
-
-def _series_messages(series: Series, log_ns: Times) -> Iterator[Message]:
-    layout, order = LAYOUTS[series.type], np.argsort(log_ns, kind="stable")
-    strings = {"frame_id": series.frame_id, "child_frame_id": series.child_frame_id}
-    for first in range(0, len(series), _BATCH):
-        rows = order[first : first + _BATCH]
-        columns = {name: values[rows] for name, values in series.columns.items()}
-        payloads = encode(layout, series.t_ns[rows], columns, strings)
-        for t_ns, payload in zip(log_ns[rows].tolist(), payloads, strict=True):
-            yield t_ns, series.topic, payload
 
 
 def _cloud_messages(clouds: Clouds, log_ns: Times) -> Iterator[Message]:
