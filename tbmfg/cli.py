@@ -202,7 +202,7 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
         if any(counts[part] for counts in summary["sensors"].values())
     ]
     sensors = [(name, *(str(counts[part]) for part in counted)) for name, counts in summary["sensors"].items()]
-    _print_table(["sensor", *counted], sensors)
+    _print_table(["sensor", *counted], sensors, justify="right")
     for key in ("metrics", "metrics_smoothed"):
         metrics = summary.get(key) or {}
         known = [(name, _number(value)) for name, value in metrics.items() if value is not None]
@@ -212,19 +212,19 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
     typer.echo(f"results: {output}")
 
 
-def _print_table(header: list[str], rows: list[tuple[str, ...]]) -> None:
-    """Columns, names to the left and numbers to the right; nothing where there are no rows."""
+def _print_table(header: list[str], rows: list[tuple[str, ...]], *, justify: str = "left") -> None:
+    """Columns under their titles, all but the first justified; nothing where there are no rows."""
     if not rows:
         return
     from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for title in header:
-        table.add_column(title, overflow="fold")
+    for column, title in enumerate(header):
+        table.add_column(title, overflow="fold", justify=justify if column else "left")
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False).print(table)
+    Console(highlight=False, markup=False).print(table)
 
 
 def _number(value: float | tuple[float, ...] | None) -> str:

@@ -56,13 +56,13 @@ def run(
     started = time.perf_counter()
     log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
     rig = rig_for(log, rig, overrides)
-    without = dropped_sensors(rig, without, only, [sensor for sensor, _, _ in outages])
+    without = dropped_sensors(rig, without, only)
     reference = find_truth(truth, log, rig)
     prepared = prepare(log, rig, outages=tuple(outages), without=without, progress=progress)
     result = estimate(estimator, prepared, progress=progress)
     wall_s = time.perf_counter() - started
 
-    result.warnings = list(dict.fromkeys([*log.damage, *prepared.warnings, *result.warnings]))
+    result.warnings = list(dict.fromkeys([*prepared.warnings, *result.warnings]))
     span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
     summary: dict[str, Any] = {
         "tbmfg_version": __version__,
@@ -106,16 +106,13 @@ def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = (
     return override(rig, overrides) if overrides else rig
 
 
-def dropped_sensors(
-    rig: Rig, without: Collection[str], only: Collection[str], outages: Collection[str] = ()
-) -> tuple[str, ...]:
-    """The sensors of ``rig`` that ``without`` and ``only`` leave out, every name given being checked."""
-    for option, names in (("--without", without), ("--only", only), ("--outage", outages)):
+def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -> tuple[str, ...]:
+    """The sensors of ``rig`` that ``without`` and ``only`` leave out."""
+    for option, names in (("--without", without), ("--only", only)):
         for name in names:
             if name not in rig.sensors:
-                raise TbmfgError(
-                    f"{option} {name}: the rig {rig.name} has no such sensor; it has {', '.join(rig.sensors)}"
-                )
+                known = ", ".join(rig.sensors)
+                raise TbmfgError(f"{option} {name}: the rig {rig.name} has no such sensor; it has {known}")
     if "imu" in without:
         raise TbmfgError("--without imu: every estimator needs the IMU")
     kept = {"imu", *only} if only else set(rig.sensors)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -56,7 +55,7 @@ def write_result(
         _write_trajectory_files(folder, "trajectory.tum", "result.npz", result.trajectory)
         if result.smoothed is not None:
             _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
-        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=None)
+        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=_diagnostics(result))
         (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
         (folder / SUMMARY).write_text(to_json(summary), "utf-8")
 
@@ -79,7 +78,7 @@ def write_atomically(output: Path, names: Iterable[str], write: Callable[[Path],
             (output / name).unlink(missing_ok=True)
         for name in names:
             if (scratch / name).exists():
-                os.replace(scratch / name, output / name)
+                (scratch / name).replace(output / name)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
         if made and not any(output.iterdir()):
@@ -116,6 +115,17 @@ def summarise(result: Result, t0_ns: int) -> dict[str, Any]:
         ],
         "innovations": {name: _innovation_summary(values) for name, values in result.innovations.items()},
     }
+
+
+def _diagnostics(result: Result) -> dict[str, str]:
+    """The same for whoever opens result.mcap in a viewer: one line of text each."""
+    lines = {"estimator": result.estimator}
+    for name, value in result.calibration.items():
+        found, sd = np.asarray(value.value).tolist(), np.asarray(value.sd).tolist()
+        lines[name] = f"{found}, sd {sd}" if value.estimated else f"{found}, not estimated"
+    for name, counts in result.counts.items():
+        lines[name] = ", ".join(f"{part} {count}" for part, count in asdict(counts).items() if count)
+    return lines | {f"warning {number}": text for number, text in enumerate(result.warnings, 1)}
 
 
 def _innovation_summary(innovations: Innovations) -> dict[str, Any]:

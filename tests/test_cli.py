@@ -185,7 +185,6 @@ def test_faults_of_the_input_take_one_line(toy, tmp_path):
     assert "the rig toy has no such sensor" in fault("run", "toy.mcap", "-o", out, "--without", "prisma")
     assert "every estimator needs the IMU" in fault("run", "toy.mcap", "-o", out, "--without", "imu")
     assert "--only gnss" in fault("run", "toy.mcap", "-o", out, "--only", "prism,gnss")
-    assert "--outage gnss" in fault("run", "toy.mcap", "-o", out, "--outage", "gnss:1:2")
     assert "sigma" in fault("run", "toy.mcap", "-o", out, "--set", "sensors.prism.sigma=7")
     assert "--truth /nope" in fault("run", "toy.mcap", "-o", out, "--truth", "/nope")
     assert not (tmp_path / "out").exists()
@@ -273,6 +272,7 @@ def test_help_answers_at_once():
         taken.append(time.perf_counter() - started)
     assert ran.returncode == 0
     assert "run" in ran.stdout
+    # on a machine with more to do than processors the clock says nothing
     assert min(taken) < 0.5 or os.getloadavg()[0] > os.cpu_count()
 
 

@@ -6,11 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from tbmfg import results
 from tbmfg.errors import TbmfgError
+from tbmfg.mcap import read_log
 from tbmfg.results import (
     FILES,
     find_truth,
@@ -113,6 +116,25 @@ def test_every_file_is_written(tmp_path):
     assert json.loads((tmp_path / "new" / "out" / "summary.json").read_text()) == {"a": 1}
 
 
+def test_the_mcap_holds_poses_and_what_happened(tmp_path):
+    done = result()
+    done.counts["prism"] = Counts(received=10, used=9, gated=1)
+    done.calibration["noise_factor"] = Calibrated(np.float64(5.0), 0.0, False)
+    done.warnings.append("imu: 3 samples lost")
+    write_result(tmp_path, done, {}, "name: rig\n")
+    odometry = read_log(tmp_path / "result.mcap").series["/tbmfg/odometry"]
+    assert_array_equal(odometry.t_ns, done.trajectory.t_ns)
+    with open(tmp_path / "result.mcap", "rb") as file:
+        messages = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(["/diagnostics"])
+        values = {entry.key: entry.value for *_, message in messages for entry in message.status[0].values}
+    assert values == {
+        "estimator": "batch",
+        "noise_factor": "5.0, not estimated",
+        "prism": "received 10, used 9, gated 1",
+        "warning 1": "imu: 3 samples lost",
+    }
+
+
 def test_results_are_not_overwritten_without_force(tmp_path):
     write_result(tmp_path, result(smoothed=True), {"run": 1}, "name: rig\n")
     with pytest.raises(TbmfgError, match=r"already holds trajectory\.tum, .*--force") as refusal:
@@ -162,7 +184,7 @@ def test_a_kill_while_moving_leaves_no_summary(tmp_path, monkeypatch):
             raise SystemExit
         moved.append(source.rename(target))
 
-    monkeypatch.setattr(results.os, "replace", killed_at_the_third)
+    monkeypatch.setattr(results.Path, "replace", killed_at_the_third)
     with pytest.raises(SystemExit):
         write_result(tmp_path, result(), {"run": 2}, "name: rig\n", force=True)
     assert names_in(tmp_path) == ["result.npz", "trajectory.tum"]

@@ -189,7 +189,7 @@ def _rms(values: Floats | None, unit: float = 1.0) -> float | None:
     """Root of the mean squared norm of rows (m, k) or values (m,), times ``unit``; None without any."""
     if values is None or not len(values):
         return None
-    return unit * float(np.sqrt((values**2).sum() / len(values)))
+    return float(unit * np.sqrt((values**2).sum() / len(values)))
 
 
 def _rotation_error(R_true: Rotation, quat_xyzw: Floats) -> Floats:
