@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from datasets.motion import Kinematics, Motion, rotate_back
+from tbmfg.errors import RigError
 from tbmfg.rig import Origin, Rig, dump_rig, kind_of
 from tbmfg.timeseries import NS, Floats, Series, Times
 
@@ -119,6 +120,8 @@ def simulate(
     truth_rate_hz: float = 50.0,
 ) -> Simulation:
     """A log of every sensor of ``rig`` whose kind is in ``sensors``; the others leave the rig."""
+    if rig.origin.latitude_deg is None:
+        raise RigError(f"{name}: origin.latitude_deg is not given; it says what gravity and Earth rate are felt")
     scene = Scene(motion, rig.origin, duration_s)
     kept = {key: sensor for key, sensor in rig.sensors.items() if kind_of(key) in sensors}
     sensed = {key: sensors[kind_of(key)](scene, sensor, stream(seed, key)) for key, sensor in kept.items()}

@@ -91,6 +91,8 @@ def make(
         "odometer": partial(odometer, rate_hz=odometer_rate_hz),
         "magnetometer": partial(magnetometer, rate_hz=magnetometer_rate_hz),
     }
+    if "odometer" not in machine.sensors:
+        raise RigError("tbm-drive: the rig has no sensor called odometer; its arm_m says where the machine stands")
     tracks: Odometer = machine.sensors["odometer"]
     if tracks.yaw_deg or tracks.pitch_deg or tracks.mounting_sd_deg:
         raise RigError("tbm-drive: the tracks run along b's x axis; its odometer has no yaw, pitch or mounting sd")
