@@ -17,7 +17,7 @@ class CdrReader:
         order = BYTE_ORDER.get(bytes(payload[:2]))
         if order is None:
             raise ValueError(f"encapsulation {bytes(payload[:2]).hex()} is not plain CDR")
-        self.payload = payload
+        self.payload = memoryview(payload)
         self.order = order
         self.at = ENCAPSULATION
 
@@ -27,8 +27,8 @@ class CdrReader:
         start = self._skip((ENCAPSULATION - self.at) % size + size) - size
         return struct.unpack_from(self.order + code, self.payload, start)[0]
 
-    def octets(self, count: int) -> bytes | memoryview:
-        """The next ``count`` bytes, not copied if the payload is a memoryview."""
+    def octets(self, count: int) -> memoryview:
+        """The next ``count`` bytes, not copied."""
         stop = self._skip(count)
         return self.payload[stop - count : stop]
 

@@ -25,7 +25,7 @@ MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 _FOOTER_SIZE = _HEAD.size + 20
 _RAW_BLOCK = 1 << 20  # records outside chunks are handed on in blocks of about this many bytes
-_RECORD_ERRORS = (McapError, struct.error, UnicodeDecodeError, EOFError, ValueError, IndexError)
+_RECORD_ERRORS = (McapError, struct.error, ValueError, IndexError, OverflowError)
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 _FOREIGN = {
     b"SQLite format 3": "a rosbag2 database; convert it with: ros2 bag convert (storage_id: mcap)",
@@ -88,18 +88,20 @@ class McapFile:
         while True:
             opcode, length = self._head(at)
             stop = at + _HEAD.size + length
-            broken = opcode == 0 or stop > self._limit(at)
+            limit = self._limit(at)
+            broken = opcode == 0 or stop > limit
             plain = opcode in _PLAIN and not broken
             if raw and (not plain or len(raw) > _RAW_BLOCK):
                 yield Block(bytes(raw), -1, raw_start)
                 raw.clear()
             if broken:
-                if opcode == Opcode.CHUNK and stop > self.size:
+                if opcode == Opcode.CHUNK and limit == self.size:
                     yield from self._cut_chunk(at)
                     return
-                at = self._resume(at)
-                if at == self.size:
+                self._note_break(at, limit)
+                if limit == self.size:
                     return
+                at = limit
                 continue
             if plain:
                 raw_start = raw_start if raw else at
@@ -152,9 +154,8 @@ class McapFile:
         following = bisect_right(self._chunks, at)
         return self._chunks[following] if following < len(self._chunks) else self.size
 
-    def _resume(self, at: int) -> int:
-        """Note the damage at ``at``; where to read on."""
-        limit = self._limit(at)
+    def _note_break(self, at: int, limit: int) -> None:
+        """Note that no record begins at ``at``; reading goes on at ``limit``."""
         if limit < self.size:
             self.damage.append(
                 f"{self.name}: {limit - at} bytes from byte {at} are no records; skipped to the next chunk"
@@ -166,7 +167,6 @@ class McapFile:
                 f"{self.name}: {self.size - at} bytes from byte {at} to the end are no complete record: "
                 "the file was cut or overwritten there"
             )
-        return limit
 
     def _read_summary(self) -> list[int]:
         """Declarations from the summary section; the byte offsets of the chunks it lists, sorted."""

@@ -156,7 +156,7 @@ def clock_problems(t_ns: Times, log_ns: Times) -> tuple[str, ...]:
         problems.append(f"stamps jump back {(steps < 0).sum()} times, by up to {_duration(-steps.min())}")
     ahead = steps - np.diff(log_ns) * 1e-9
     if ahead.max() > _FAR_S:
-        when = (log_ns[np.argmax(ahead)] - log_ns[0]) * 1e-9
+        when = (log_ns[np.argmax(ahead) + 1] - log_ns[0]) * 1e-9
         problems.append(f"stamps jump ahead of the log times by {_duration(ahead.max())}, {when:.1f} s into the topic")
     delay = (log_ns - t_ns) * 1e-9
     typical = float(np.median(delay))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import struct
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import yaml
 from mcap.opcode import Opcode
+from mcap.records import Channel
 
 from tbmfg.errors import LogError
 from tbmfg.mcap import clouds
@@ -83,15 +84,15 @@ def scan(
             recording.damage.append(str(error))
             continue
         with mcap:
-            channels: dict[int, Stream | None] = {}
+            distributor = _Distributor(recording, mcap, topics)
             for block in mcap.blocks():
-                _distribute(recording, mcap, block, channels, topics)
+                distributor.take(block)
                 if progress:
                     progress((sum(sizes[:number]) + mcap.position) / sum(sizes))
-            recording.attachments |= mcap.attachments
-            recording.damage += mcap.damage
+            distributor.finish()
     if not recording.messages:
-        raise LogError("; ".join([f"{path}: no message could be read from {sum(sizes)} bytes", *recording.damage]))
+        reasons = recording.damage[:4] + ["..."] * (len(recording.damage) > 4)
+        raise LogError("; ".join([f"{path}: no message could be read from {sum(sizes)} bytes", *reasons]))
     if progress:
         progress(1.0)
     return recording
@@ -124,67 +125,80 @@ def recording_files(path: str | os.PathLike) -> list[Path]:
     return [path / name if (path / name).exists() else path / Path(name).name for name in names]
 
 
-def _distribute(
-    recording: Recording,
-    mcap: McapFile,
-    block: Block,
-    channels: dict[int, Stream | None],
-    topics: Collection[str] | None,
-) -> None:
-    """Hand the messages of a block to the streams of their topics."""
-    entries: defaultdict[int, Entries] = defaultdict(list)
-    data, end, at = block.data, len(block.data), 0
-    while at + _HEAD.size <= end:
-        opcode, length = _HEAD.unpack_from(data, at)
-        start = at + _HEAD.size
-        if start + length > end or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-            break
-        at = start + length
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-            entries[channel].append((log_ns, start + _MESSAGE.size, at))
-        else:
-            mcap.declare(opcode, data[start:at])
-    if at < end and block.whole:
-        mcap.damage.append(f"{mcap.name}: {end - at} bytes in the chunk at byte {block.chunk} are no records; skipped")
-    for channel, messages in entries.items():
-        recording.messages += len(messages)
-        if channel not in channels:
-            channels[channel] = _open(recording, mcap, channel, topics)
-        stream = channels[channel]
-        if stream:
-            stream.take(block, mcap.path, messages)
+class _Distributor:
+    """Hands the messages of one file to the streams of their topics."""
 
+    def __init__(self, recording: Recording, mcap: McapFile, topics: Collection[str] | None) -> None:
+        self._recording = recording
+        self._mcap = mcap
+        self._topics = topics
+        self._streams: dict[int, Stream | None] = {}  # by channel; None: its messages are passed over
+        self._undeclared: Counter[int] = Counter()
 
-def _open(recording: Recording, mcap: McapFile, number: int, topics: Collection[str] | None) -> Stream | None:
-    """The stream for a channel; None where its messages are passed over."""
-    channel = mcap.channels.get(number)
-    if channel is None:
-        mcap.damage.append(f"{mcap.name}: messages of channel {number}, which is declared nowhere, skipped")
-        return None
-    schema = mcap.schemas.get(channel.schema_id)
-    topic, type = channel.topic, full_name(schema.name) if schema else ""
-    static = type == TRANSFORMS and topic.endswith("tf_static")
-    if topics is not None and topic not in topics and not static:
-        return None
-    known = recording.streams.get(topic)
-    if known:
-        if known.type == type:
-            return known
-        mcap.damage.append(f"{mcap.name}: {topic} is {known.type} and also {type or 'of no type'}; the latter skipped")
-        return None
-    stream: Stream = Stream(topic, type)
-    if channel.message_encoding != "cdr":
-        recording.unknown[topic] = f"{type} (message encoding {channel.message_encoding!r})"
-    elif schema and schema.encoding not in _SCHEMA_ENCODINGS:
-        recording.unknown[topic] = f"{type} (schema encoding {schema.encoding!r})"
-    elif type in LAYOUTS:
-        stream = SeriesStream(topic, type, LAYOUTS[type])
-    elif type == clouds.TYPE:
-        stream = CloudStream(topic, type)
-    elif static:
-        stream = TransformStream(topic, type)
-    elif type != TRANSFORMS:  # /tf is understood but not kept: poses over time come as Odometry
-        recording.unknown[topic] = type
-    recording.streams[topic] = stream
-    return stream
+    def take(self, block: Block) -> None:
+        """All messages of a block; declarations among them go to the file."""
+        entries: defaultdict[int, Entries] = defaultdict(list)
+        data, end, at = block.data, len(block.data), 0
+        while at + _HEAD.size <= end:
+            opcode, length = _HEAD.unpack_from(data, at)
+            start = at + _HEAD.size
+            if start + length > end or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+                break
+            at = start + length
+            if opcode == Opcode.MESSAGE:
+                channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+                entries[channel].append((log_ns, start + _MESSAGE.size, at))
+            else:
+                self._mcap.declare(opcode, data[start:at])
+        if at < end and block.whole:
+            self._note(f"{end - at} bytes in the chunk at byte {block.chunk} are no records; skipped")
+        for channel, messages in entries.items():
+            if channel not in self._mcap.channels:
+                self._undeclared[channel] += len(messages)
+                continue
+            self._recording.messages += len(messages)
+            if channel not in self._streams:
+                self._streams[channel] = self._open(self._mcap.channels[channel])
+            stream = self._streams[channel]
+            if stream:
+                stream.take(block, self._mcap.path, messages)
+
+    def finish(self) -> None:
+        """Hand on what concerns the file as a whole."""
+        for channel, count in self._undeclared.items():
+            self._note(f"{count} messages of channel {channel}, which is declared nowhere, skipped")
+        self._recording.attachments |= self._mcap.attachments
+        self._recording.damage += self._mcap.damage
+
+    def _note(self, damage: str) -> None:
+        self._mcap.damage.append(f"{self._mcap.name}: {damage}")
+
+    def _open(self, channel: Channel) -> Stream | None:
+        """The stream for a channel."""
+        schema = self._mcap.schemas.get(channel.schema_id)
+        topic, type = channel.topic, full_name(schema.name) if schema else ""
+        static = type == TRANSFORMS and topic.endswith("tf_static")
+        if self._topics is not None and topic not in self._topics and not static:
+            return None
+        known = self._recording.streams.get(topic)
+        if known:
+            if known.type == type:
+                return known
+            self._note(f"{topic} is {known.type} and also {type or 'of no type'}; the latter skipped")
+            return None
+        stream: Stream = Stream(topic, type)
+        unknown = self._recording.unknown
+        if channel.message_encoding != "cdr":
+            unknown[topic] = f"{type} (message encoding {channel.message_encoding!r})"
+        elif schema and schema.encoding not in _SCHEMA_ENCODINGS:
+            unknown[topic] = f"{type} (schema encoding {schema.encoding!r})"
+        elif type in LAYOUTS:
+            stream = SeriesStream(topic, type, LAYOUTS[type])
+        elif type == clouds.TYPE:
+            stream = CloudStream(topic, type)
+        elif static:
+            stream = TransformStream(topic, type)
+        elif type != TRANSFORMS:  # /tf is understood but not kept: poses over time come as Odometry
+            unknown[topic] = type
+        self._recording.streams[topic] = stream
+        return stream
