@@ -4,7 +4,8 @@ It stands, starts its pump, drives at 0.1 m/s straight and in bends, turns on th
 floor that slopes by up to 2 degrees. The odometer's contact point is the centre between the tracks, about which
 a tracked machine turns: in the undisturbed travel it neither slides sideways nor leaves the floor.
 
-``vibration=0 slide=1`` follows the estimators' model exactly: every error is a draw from the rig.
+``vibration=0 slide=1`` follows the estimators' model: every error is a draw from the rig, except that a standing
+machine does not slide at all.
 
 - Vibration is real motion of the body, and breaks three assumptions: that the motion is smooth within an IMU
   period (small at 475 Hz, but lines above half the rate alias), that the prism moves as the machine does, and
