@@ -74,7 +74,13 @@ class GyroFrame:
 
 
 def position_rows(
-    sensor: PositionSensor, fixes: Samples, offset_s: float, keyframes_s: Floats, frame: GyroFrame, origin_n: Floats, calib: slice
+    sensor: PositionSensor,
+    fixes: Samples,
+    offset_s: float,
+    keyframes_s: Floats,
+    frame: GyroFrame,
+    origin_n: Floats,
+    calib: slice,
 ) -> Rows:
     """Fixes of a prism or antenna at their true times; sigma from the rig at the measured range."""
     t = fixes.t_s - offset_s

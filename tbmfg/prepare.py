@@ -16,6 +16,7 @@ from tbmfg.errors import EstimationError, LogError, RigError
 from tbmfg.filters import ins
 from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy, rotation_z, yaw_of
 from tbmfg.inertial import alignment
+from tbmfg.inertial.noise import spectral_floor
 from tbmfg.inertial.steps import Steps, compensate, make_steps, to_ns
 from tbmfg.inertial.strapdown import rotations
 from tbmfg.measure import GyroFrame, Samples
@@ -33,7 +34,7 @@ VALUES = {  # column of the series that each kind of sensor measures with
     "barometer": lambda series: pressure_height(series["pressure"]),
 }
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
-UNKNOWN_YAW = np.deg2rad(90.0)  # a heading prior wider than this is no prior
+FACTOR_RANGE = (0.3, 1e3)  # what a spectrum may say of a data sheet
 
 
 @dataclass(slots=True)
@@ -86,8 +87,7 @@ def prepare(
     counts = {"imu": imu_counts, **counts}
     setup = _align(rig, steps, samples, counts, warnings)
     offsets = {name: rig.sensors[name].clock_offset for name in samples if _is_position(rig, name)}
-    factor = rig.imu.noise_factor
-    problem = _search(setup, offsets, factor, tell)
+    problem = _search(setup, offsets, tell)
     problem.intervals = [
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
@@ -106,9 +106,13 @@ def _imu_steps(log: Log, rig: Rig) -> tuple[Steps, Counts]:
     series = log.series.get(rig.imu.topic)
     if series is None or "gyro" not in series.columns:
         have = ", ".join(sorted(t for t, s in log.series.items() if s.type.endswith("Imu"))) or "none"
-        raise LogError(f"{log.path}: no Imu messages on {rig.imu.topic!r}; Imu topics in the log: {have}; set sensors.imu.topic")
+        raise LogError(
+            f"{log.path}: no Imu messages on {rig.imu.topic!r}; Imu topics in the log: {have}; set sensors.imu.topic"
+        )
     if any(rig.imu.T_bi.xyz_m):
-        raise RigError(f"sensors.{name}.T_bi.xyz_m must be zero: b has its origin at the IMU; move the other sensors' arms instead")
+        raise RigError(
+            f"sensors.{name}.T_bi.xyz_m must be zero: b has its origin at the IMU; move the other sensors' arms instead"
+        )
     c = series.counts
     counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
     return make_steps(series, rig.imu.T_bi.R, rig.imu.stamp), counts
@@ -129,7 +133,9 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
         counts[name] = count = Counts(received=c.received, duplicate=c.duplicate, nonfinite=c.nonfinite)
         if name in without or kind not in VALUES:
             if name not in without:
-                warnings.append(f"{name}: no model for this kind of sensor yet; its {len(series)} messages are not used")
+                warnings.append(
+                    f"{name}: no model for this kind of sensor yet; its {len(series)} messages are not used"
+                )
             count.unused = len(series)
             continue
         t = seconds(series.t_ns, steps.t0_ns)
@@ -143,7 +149,9 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
         count.unused = int((~out & ~inside).sum())
         keep = ~out & inside
         if keep.sum() < 2:
-            warnings.append(f"{name}: {int(keep.sum())} of {len(t)} samples lie in the IMU span and outside outages; it is not used")
+            warnings.append(
+                f"{name}: {int(keep.sum())} of {len(t)} samples lie in the IMU span and outside outages; it is not used"
+            )
             count.unused += int(keep.sum())
             continue
         samples[name] = Samples(name, t[keep], np.ascontiguousarray(VALUES[kind](series)[keep]))
@@ -167,7 +175,9 @@ def _parameters(rig: Rig, samples: dict[str, Samples]) -> Parameters:
     return Parameters(tuple(names), np.array(mean, float), np.array(sd, float), np.array(mean, float))
 
 
-def _align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> _Setup:
+def _align(
+    rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]
+) -> _Setup:
     """Initial attitude, gyro bias, and where the machine stands."""
     still = alignment.still_intervals(steps)
     bias_gyro = np.zeros(3)
@@ -196,7 +206,9 @@ def _align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str
             steps, bias_gyro, R_level, position.t_s, position.values, offsets, rig.origin.gravity
         )
         if fit is None:
-            warnings.append("heading is not observable: no stretch of 8 s has motion that turns it into a heading; set initial.yaw_deg")
+            warnings.append(
+                "heading is not observable: no stretch of 8 s has motion that turns it into a heading; set initial.yaw_deg"
+            )
         else:
             R_start, yaw_sd = rotation_z(fit.heading) @ R_level, max(2.0 * fit.heading_sd, np.deg2rad(5.0))
     else:
@@ -215,7 +227,9 @@ def _with_given_tilt(R_level: Floats, roll: float | None, pitch: float | None) -
     """The levelled start attitude with roll and pitch from the rig, where it gives them."""
     if roll is None and pitch is None:
         return R_level
-    found = np.array([np.arctan2(R_level[2, 1], R_level[2, 2]), -np.arcsin(np.clip(R_level[2, 0], -1, 1)), yaw_of(R_level)])
+    found = np.array(
+        [np.arctan2(R_level[2, 1], R_level[2, 2]), -np.arcsin(np.clip(R_level[2, 0], -1, 1)), yaw_of(R_level)]
+    )
     given = np.array([found[0] if roll is None else roll, found[1] if pitch is None else pitch, found[2]])
     return rotation_from_rpy(given)
 
@@ -233,7 +247,9 @@ def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R
     return None
 
 
-def _confirmed_rest(rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def _confirmed_rest(
+    rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
     """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
     confirmed = []
     for start, end in still:
@@ -276,8 +292,8 @@ def _vibration_speed(steps: Steps, intervals: list[tuple[float, float]]) -> floa
     return float(np.sqrt(np.mean(squares))) if squares else 0.0
 
 
-def _build(setup: _Setup, offsets: dict[str, float], factor: float, end_s: float | None = None) -> Problem:
-    """The problem for given clock offsets and noise factor, up to ``end_s``."""
+def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: float | None = None) -> Problem:
+    """The problem for given clock offsets and noise factors (gyro, accelerometer), up to ``end_s``."""
     rig, steps = setup.rig, setup.steps
     end_s = steps.end_s if end_s is None else min(end_s, steps.end_s)
     samples = {
@@ -323,7 +339,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factor: float, end_s: float
     imu = rig.imu
     inertial = Inertial(
         steps, setup.gyro, setup.acc,
-        (factor * imu.gyro_density) ** 2 + steps.extra_gyro, (factor * imu.acc_density) ** 2 + steps.extra_acc,
+        (factors[0] * imu.gyro_density) ** 2 + steps.extra_gyro, (factors[1] * imu.acc_density) ** 2 + steps.extra_acc,
         imu.gyro_walk**2, imu.acc_walk**2, rig.origin.rate_n, np.array([0.0, 0.0, -rig.origin.gravity]),
     )  # fmt: skip
     drift = np.array(drift_start) - setup.origin_n[2] - position[2] if drift_names else np.zeros(0)
@@ -371,37 +387,49 @@ def _prior(setup: _Setup, x: Floats, drift_sd: Floats, has_fixes: bool) -> Prior
     return Prior(x, covariance(start.yaw_sd), covariance(setup.yaw_sd))
 
 
-def _search(setup: _Setup, offsets: dict[str, float], factor, tell: Callable[[str, float], None]) -> Problem:
-    """Clock offsets and noise factor from the log, alternating, then the problem at what was found.
+def _search(setup: _Setup, offsets: dict[str, float], tell: Callable[[str, float], None]) -> Problem:
+    """Clock offsets and noise factors from the log, alternating, then the problem at what was found.
 
     A constant's last estimate by a filter holds all that the log says about it, so the offsets are states of ``ins``;
-    keyframes move with them until they stand. The factor minimises the filter's likelihood cost.
+    keyframes move with them until they stand. Noise: the IMU's own spectrum says how much noisier than the data
+    sheet gyro and accelerometer can be at most; one scale on both minimises the filter's likelihood cost.
     """
-    auto = factor == "auto"
-    value, sd = (1.0 if auto else float(factor)), 0.0
+    imu = setup.rig.imu
+    auto = imu.noise_factor == "auto"
+    floors = spectral_floor(setup.steps) if auto else (imu.gyro_density, imu.acc_density)
+    split = np.clip([floors[0] / imu.gyro_density, floors[1] / imu.acc_density], *FACTOR_RANGE)
+    scale, sd = (1.0 if auto else float(imu.noise_factor)), 0.0
     names = setup.parameters.names
     unknown = [n for n in offsets if setup.parameters.sd[names.index(f"{n}.clock_offset")] > 0]
     for name in unknown:
         offsets[name] = _coarse_offset(setup, name)
-    for turn in range(3 if auto and unknown else 1):
+    for turn in range(2 if auto and unknown else 1):
+        if unknown:
+            _settle_offsets(setup, offsets, scale * split, unknown)
         if auto:
-            value, sd = _noise_factor(setup, offsets, start=value if turn else None)
-            tell("prepare", 0.2 + 0.2 * turn)
-        moved = 0.0
-        for _ in range(4 if unknown else 0):
-            filtered = ins.run(_build(setup, offsets, value, SEARCH_S))
-            moved = 0.0
-            for name in unknown:
-                step = float(filtered.c[names.index(f"{name}.clock_offset")])
-                offsets[name] += step
-                moved = max(moved, abs(step))
-            if moved < 1e-4:
-                break
-        if moved < 1e-4 and turn:
-            break
-    problem = _build(setup, offsets, value)
-    problem.calibration["noise_factor"] = Calibrated(value, sd, auto)
+            scale, sd = _noise_scale(setup, offsets, split, scale)
+        tell("prepare", 0.5 + 0.25 * turn)
+    problem = _build(setup, offsets, scale * split)
+    factors = {
+        "noise_factor_gyro": split[0],
+        "noise_factor_acc": split[1],
+        "noise_factor": float(np.sqrt(np.prod(split))),
+    }
+    for key, value in factors.items():
+        problem.calibration[key] = Calibrated(float(scale * value), float(sd * value), auto)
     return problem
+
+
+def _settle_offsets(setup: _Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> None:
+    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place."""
+    for _ in range(4):
+        problem = _build(setup, offsets, factors, SEARCH_S)
+        c = ins.run(problem).c
+        steps = {name: float(c[problem.parameters.names.index(f"{name}.clock_offset")]) for name in unknown}
+        for name, step in steps.items():
+            offsets[name] += step
+        if max(map(abs, steps.values())) < 1e-4:
+            return
 
 
 def _coarse_offset(setup: _Setup, name: str) -> float:
@@ -410,32 +438,31 @@ def _coarse_offset(setup: _Setup, name: str) -> float:
     spread = 3.0 * sensor.clock_offset_sd
     grid = sensor.clock_offset + np.linspace(-spread, spread, 2 * max(2, int(np.ceil(spread / 0.02))) + 1)
     R_level = setup.R_start
-    fit = alignment.fit_motion(
-        setup.steps, setup.bias_gyro, R_level, s.t_s, s.values, grid, setup.rig.origin.gravity
-    )
+    fit = alignment.fit_motion(setup.steps, setup.bias_gyro, R_level, s.t_s, s.values, grid, setup.rig.origin.gravity)
     if fit is None:
-        setup.warnings.append(f"{name}: clock offset not observable: the machine hardly moved; it stays at the rig's value")
+        setup.warnings.append(
+            f"{name}: clock offset not observable: the machine hardly moved; it stays at the rig's value"
+        )
         return sensor.clock_offset
     return fit.clock_offset_s
 
 
-def _noise_factor(setup: _Setup, offsets: dict[str, float], start: float | None) -> tuple[float, float]:
-    """Noise factor that minimises the cost of ``ins``, and its sd from the curvature: -2 log likelihood in log factor."""
+def _noise_scale(setup: _Setup, offsets: dict[str, float], split: Floats, start: float) -> tuple[float, float]:
+    """Scale on ``split`` that minimises the cost of ``ins`` (-2 log likelihood), and its sd from the curvature in
+    the logarithm; at least what the data sheet says, at most what the spectrum allows."""
     costs: dict[float, float] = {}
 
     def cost(log2: float) -> float:
         if log2 not in costs:
-            costs[log2] = ins.run(_build(setup, offsets, 2.0**log2, SEARCH_S), fixed=("clock_offset",)).cost
+            problem = _build(setup, offsets, 2.0**log2 * split, SEARCH_S)
+            costs[log2] = ins.run(problem, fixed=("clock_offset",)).cost
         return costs[log2]
 
-    grid = [float(k) for k in range(-1, 7)] if start is None else [round(np.log2(start)) + k for k in (-1.0, 0.0, 1.0)]
-    best = min(grid, key=cost)
-    while (lower := min((best - 1.0, best + 1.0), key=cost)) and cost(lower) < cost(best):
+    step, best = 0.5, round(2.0 * np.log2(start)) / 2.0
+    while (lower := min((best - step, best + step), key=cost)) is not None and cost(lower) < cost(best):
         best = lower
-    a, b, c = (cost(best + k) for k in (-0.5, 0.0, 0.5))
-    curvature = (a - 2 * b + c) / 0.25
-    if curvature <= 0:
-        return 2.0**best, 0.0
-    vertex = best + 0.25 * (a - c) / (a - 2 * b + c)
-    factor = 2.0 ** float(np.clip(vertex, best - 1, best + 1))
-    return factor, factor * float(np.sqrt(2.0 / curvature)) * np.log(2.0)
+    a, b, c = (cost(best + k) for k in (-step, 0.0, step))
+    curvature = (a - 2.0 * b + c) / step**2
+    vertex = best + 0.5 * step * (a - c) / (a - 2.0 * b + c)
+    scale = 2.0**vertex
+    return float(scale), float(scale * np.sqrt(2.0 / curvature) * np.log(2.0))

@@ -13,6 +13,9 @@ from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Times
 
 
+GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are counted as gated
+
+
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """Constant calibrations side by side in one vector: names such as ``prism.arm_x``, prior mean and sd (0: known).

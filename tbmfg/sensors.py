@@ -99,7 +99,9 @@ def odometer(z, data, xi, xj, c):
         x, y, M, arm, B = xi[k], xj[k], data[k, :9].reshape(3, 3), data[k, 9:12], data[k, 12:15]
         step = _unrotate(x, y[9:12] + _rotate(y, arm) - x[9:12])
         bias = x[18:21] - data[k, 15:18]
-        drift = np.array([B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]])
+        drift = np.array(
+            [B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]]
+        )
         for a in range(3):
             travelled = M[a, 0] * e[0] + M[a, 1] * e[1] + M[a, 2] * e[2] + drift[a]
             r[k, a] = step[a] - arm[a] - travelled * inverse

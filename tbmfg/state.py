@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tbmfg.geometry import matrix_from_quat
 from tbmfg.timeseries import Floats, Times
 
 ROT, POS, VEL, BA, BG = (slice(i, i + 3) for i in range(0, 15, 3))
@@ -31,6 +32,10 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def rotations(self) -> Floats:
+        """R_nb, (n, 3, 3)."""
+        return matrix_from_quat(self.quat_xyzw)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,13 +15,15 @@ from scipy.stats import chi2
 
 from tbmfg.filters.kalman import correct, innovation
 from tbmfg.inertial.strapdown import correct_state, propagate
-from tbmfg.problem import Problem
+from tbmfg.problem import GATE, Problem
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
-GATE = 0.999  # probability inside the gate
 REOPEN = 10  # rows of one sensor gated in a row after which the next is let in: the state is wrong, not the sensor
+TAIL = (
+    4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it
+)
 LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
 
 
@@ -29,7 +31,7 @@ LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bia
 class Filtered:
     """States (n, 21 + e) and covariances (n, 15 + e, 15 + e) after each keyframe's rows, calibrations (m,) with
     covariance (m, m) at the end, per sensor NIS and gate flags by row, and the likelihood cost
-    sum(min(nis, gate) + log det S)."""
+    the sum of (TAIL + k) log(1 + nis / TAIL) + log det S."""
 
     x: Floats
     cov: Floats
@@ -46,7 +48,9 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     inertial, parameters, e = problem.inertial, problem.parameters, len(problem.drift_walk)
     steps = inertial.steps
     noise = inertial.psd_gyro, inertial.psd_acc, inertial.psd_bg, inertial.psd_ba, inertial.earth_n, inertial.gravity_n
-    free = np.array([k for k in parameters.free if not parameters.names[k].endswith(tuple(fixed) or ("\0",))], dtype=int)
+    free = np.array(
+        [k for k in parameters.free if not parameters.names[k].endswith(tuple(fixed) or ("\0",))], dtype=int
+    )
     d, m, n = NAV + e, len(free), len(problem.keyframes_s)
     calib, clone = slice(d, d + m), slice(d + m, d + m + 6)
 
@@ -85,7 +89,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
                 residual, H = _linearise(rows, r, x, previous, c, P.shape[0], d, m, columns[sensor], offsets[sensor])
                 value, logdet = innovation(P, H, residual)
                 nis[sensor][r] = value
-                cost += min(value, gates[sensor]) + logdet
+                cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
                 if value > gates[sensor] and in_a_row[sensor] < REOPEN:
                     gated[sensor][r] = True
                     in_a_row[sensor] += 1

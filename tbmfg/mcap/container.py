@@ -22,8 +22,8 @@ from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Footer, Schema
 from tbmfg.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
-_FOOTER_SIZE = _HEAD.size + 20
+HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+_FOOTER_SIZE = HEAD.size + 20
 _RAW_BLOCK = 1 << 20  # records outside chunks are handed on in blocks of about this many bytes
 _RECORD_ERRORS = (McapError, struct.error, ValueError, IndexError, OverflowError)
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
@@ -87,7 +87,7 @@ class McapFile:
         checksummed = True  # nothing so far but records that carry a checksum of their own
         while True:
             opcode, length = self._head(at)
-            stop = at + _HEAD.size + length
+            stop = at + HEAD.size + length
             limit = self._limit(at)
             broken = opcode == 0 or stop > limit
             plain = opcode in _PLAIN and not broken
@@ -105,7 +105,7 @@ class McapFile:
                 continue
             if plain:
                 raw_start = raw_start if raw else at
-                raw += self._read(at, _HEAD.size + length)
+                raw += self._read(at, HEAD.size + length)
                 checksummed = checksummed and opcode != Opcode.MESSAGE
             elif opcode == Opcode.CHUNK:
                 yield from self._chunk(at, length)
@@ -120,13 +120,14 @@ class McapFile:
     def load_chunk(self, at: int) -> bytes:
         """The records in the chunk at byte ``at``; raises LogError if it is not intact."""
         opcode, length = self._head(at)
-        if opcode == Opcode.CHUNK and at + _HEAD.size + length <= self.size:
-            data, fault = _unpack(self._read(at + _HEAD.size, length))
+        if opcode == Opcode.CHUNK and at + HEAD.size + length <= self.size:
+            data, fault = _unpack(self._read(at + HEAD.size, length))
             if not fault:
                 return data
         raise LogError(f"{self.path}: the chunk at byte {at} is not intact; the file changed while it was read")
 
     def load(self, start: int, stop: int) -> bytes:
+        """Bytes ``start`` to ``stop`` of the file."""
         return self._read(start, stop - start)
 
     def declare(self, opcode: int, body: bytes) -> None:
@@ -146,8 +147,8 @@ class McapFile:
         return self._file.read(count)
 
     def _head(self, at: int) -> tuple[int, int]:
-        head = self._read(at, _HEAD.size)
-        return _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+        head = self._read(at, HEAD.size)
+        return HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
 
     def _limit(self, at: int) -> int:
         """No record that begins at ``at`` reaches beyond this: the next chunk the index knows, or the end."""
@@ -174,29 +175,32 @@ class McapFile:
         tail = self._read(max(footer_at, 0), _FOOTER_SIZE + len(MAGIC))
         if footer_at < 0 or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
             return []
-        footer = Footer.read(_stream(tail[_HEAD.size :]))
+        footer = Footer.read(_stream(tail[HEAD.size :]))
         if not len(MAGIC) <= footer.summary_start < footer_at:
             return []
         summary = self._read(footer.summary_start, footer_at - footer.summary_start)
-        crc = zlib.crc32(summary + tail[: _HEAD.size + 16])  # up to the checksum itself
+        crc = zlib.crc32(summary + tail[: HEAD.size + 16])  # up to the checksum itself
         if footer.summary_crc not in (0, crc):
             self.damage.append(f"{self.name}: the summary at byte {footer.summary_start} is damaged and was not used")
             return []
         chunks, at = [], 0
-        while at + _HEAD.size <= len(summary):
-            opcode, length = _HEAD.unpack_from(summary, at)
-            at += _HEAD.size + length
+        while at + HEAD.size <= len(summary):
+            opcode, length = HEAD.unpack_from(summary, at)
+            at += HEAD.size + length
             body = summary[at - length : at]
-            if opcode == Opcode.CHUNK_INDEX:
-                chunks.append(ChunkIndex.read(_stream(body)).chunk_start_offset)
-            else:
+            if opcode != Opcode.CHUNK_INDEX:
                 self.declare(opcode, body)
+                continue
+            try:
+                chunks.append(ChunkIndex.read(_stream(body)).chunk_start_offset)
+            except _RECORD_ERRORS as error:
+                self.damage.append(f"{self.name}: the index of a chunk cannot be read ({error})")
         return sorted(chunks)
 
     def _chunk(self, at: int, length: int) -> Iterator[Block]:
-        data, fault = _unpack(self._read(at + _HEAD.size, length))
+        data, fault = _unpack(self._read(at + HEAD.size, length))
         if fault:
-            lost = self._indexed(at + _HEAD.size + length)
+            lost = self._indexed(at + HEAD.size + length)
             messages = f", {lost} messages" if lost else ""
             self.damage.append(f"{self.name}: chunk at byte {at} ({length} bytes{messages}) skipped: {fault}")
         else:
@@ -204,7 +208,7 @@ class McapFile:
 
     def _cut_chunk(self, at: int) -> Iterator[Block]:
         """What the beginning of a chunk that the end of the file cuts short still holds, without checksum."""
-        data, _ = _unpack(self._read(at + _HEAD.size, self.size - at))
+        data, _ = _unpack(self._read(at + HEAD.size, self.size - at))
         self.damage.append(
             f"{self.name}: the file was cut at byte {self.size} inside the chunk at byte {at}; "
             f"of its content {len(data)} bytes were read, unchecked"
@@ -214,7 +218,7 @@ class McapFile:
 
     def _check_data_section(self, end: int, length: int) -> None:
         """Messages outside chunks are covered by the checksum of the whole section only."""
-        (expected,) = struct.unpack("<I", self._read(end + _HEAD.size, 4)) if length == 4 else (0,)
+        (expected,) = struct.unpack("<I", self._read(end + HEAD.size, 4)) if length == 4 else (0,)
         crc = 0
         for at in range(0, end if expected else 0, _RAW_BLOCK):
             crc = zlib.crc32(self._read(at, min(_RAW_BLOCK, end - at)), crc)
@@ -226,13 +230,13 @@ class McapFile:
         count = 0
         while True:
             opcode, length = self._head(at)
-            if opcode != Opcode.MESSAGE_INDEX or at + _HEAD.size + length > self.size:
+            if opcode != Opcode.MESSAGE_INDEX or at + HEAD.size + length > self.size:
                 return count
             count += (length - 6) // 16
-            at += _HEAD.size + length
+            at += HEAD.size + length
 
     def _attachment(self, at: int, length: int) -> None:
-        body = self._read(at + _HEAD.size, length)
+        body = self._read(at + HEAD.size, length)
         try:
             attachment = Attachment.read(_stream(body))
             (crc,) = struct.unpack("<I", body[-4:])

@@ -10,11 +10,18 @@ import numpy as np
 
 from tbmfg.mcap.reader import scan
 from tbmfg.mcap.streams import Stream
-from tbmfg.timeseries import Log, StreamCounts, Times, Transform
+from tbmfg.timeseries import Log, Series, StreamCounts, Times, Transform
 
 GAP = 5.0  # an interval longer than this many medians is a gap
 _FAR_S = 1.0  # a stamp further than this from the log time comes from another clock
 _DRIFT_S = 0.1  # a change of the offset over the log beyond this is a drifting clock
+_WRONG_UNITS = (
+    ("acc", (0.8, 1.2), "in g, where ROS has m/s^2"),
+    ("field", (0.1, 1.5), "in gauss or normalised, where ROS has tesla"),
+    ("field", (10.0, 150.0), "in microtesla, where ROS has tesla"),
+    ("pressure", (50.0, 150.0), "in kPa, where ROS has Pa"),
+    ("pressure", (500.0, 1500.0), "in hPa, where ROS has Pa"),
+)
 _POSES = ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "PointStamped")
 _TRUTH_NAMES = ("truth", "groundtruth", "reference", "mocap", "vicon")
 _LASER_NAMES = ("laser", "spot", "detector", "psd")
@@ -46,7 +53,7 @@ class TopicInfo:
     """One topic. Types that tbmfg does not read go by log times, and have no ``counts`` and ``log_delay_s``.
 
     ``rate_hz`` and ``interval_s`` (mean rate, median interval) are NaN below two samples. ``gaps``: the
-    longest first. ``log_delay_s``: smallest, median and largest log time minus stamp. ``problems``: of the clock.
+    longest first. ``log_delay_s``: smallest, median and largest log time minus stamp. ``problems``: of clock and units.
     """
 
     topic: str
@@ -125,7 +132,7 @@ def _topic(stream: Stream, log: Log, origin_ns: int | None) -> TopicInfo:
         gaps if source is not None else (),  # log times come in bursts that mean nothing
         (float(delay.min()), float(np.median(delay)), float(delay.max())) if len(delay) else None,
         source.counts if source is not None else None,
-        clock_problems(received_ns, log_ns),
+        clock_problems(received_ns, log_ns) + unit_problems(log.series.get(stream.topic)),
     )
 
 
@@ -168,6 +175,17 @@ def clock_problems(t_ns: Times, log_ns: Times) -> tuple[str, ...]:
     if abs(change) > _DRIFT_S:
         problems.append(f"the offset to the log times changes by {change:+.3f} s from the first to the last tenth")
     return tuple(problems)
+
+
+def unit_problems(series: Series | None) -> tuple[str, ...]:
+    """Units that drivers get wrong, told from the typical size of the values."""
+    for column, (low, high), found in _WRONG_UNITS:
+        values = series.columns.get(column, ()) if series else ()
+        if len(values):
+            typical = float(np.median(np.linalg.norm(values.reshape(len(values), -1), axis=1)))
+            if low < typical < high:
+                return (f"{column} is typically {typical:.3g}: {found}",)
+    return ()
 
 
 def info_text(path: str | os.PathLike, *, progress: Callable[[float], None] | None = None) -> str:

@@ -51,7 +51,7 @@ class Rows:
     """Decoded messages, in the order they came.
 
     ``good`` (n,) tells which of the n payloads became the m rows of ``t_ns`` (m,) and ``columns``.
-    ``strings`` are those of the first row.
+    ``strings`` are those of one message.
     """
 
     good: NDArray[np.bool_]

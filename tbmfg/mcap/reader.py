@@ -15,13 +15,12 @@ from mcap.records import Channel
 
 from tbmfg.errors import LogError
 from tbmfg.mcap import clouds
-from tbmfg.mcap.container import Block, McapFile
+from tbmfg.mcap.container import HEAD, Block, McapFile
 from tbmfg.mcap.layouts import LAYOUTS
 from tbmfg.mcap.schemas import full_name
 from tbmfg.mcap.streams import TRANSFORMS, CloudStream, Entries, SeriesStream, Stream, TransformStream
 from tbmfg.timeseries import Log
 
-_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _SCHEMA_ENCODINGS = ("ros2msg", "ros2idl")
 
@@ -47,7 +46,7 @@ class Recording:
             tuple(t for s in streams if isinstance(s, TransformStream) for t in s.transforms()),
             self.attachments,
             self.unknown,
-            (*self.damage, *(f"{s.topic}: {s.undecodable} messages cannot be decoded" for s in undecoded)),
+            (*self.damage, *(f"{s.topic}: messages that cannot be decoded: {s.undecodable}" for s in undecoded)),
         )
 
 
@@ -139,9 +138,9 @@ class _Distributor:
         """All messages of a block; declarations among them go to the file."""
         entries: defaultdict[int, Entries] = defaultdict(list)
         data, end, at = block.data, len(block.data), 0
-        while at + _HEAD.size <= end:
-            opcode, length = _HEAD.unpack_from(data, at)
-            start = at + _HEAD.size
+        while at + HEAD.size <= end:
+            opcode, length = HEAD.unpack_from(data, at)
+            start = at + HEAD.size
             if start + length > end or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
                 break
             at = start + length

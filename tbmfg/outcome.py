@@ -1,0 +1,126 @@
+"""From states, covariances and residuals to a Result: calibrations, counts and what must be said."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+
+from tbmfg.geometry import quat_from_matrix
+from tbmfg.problem import Problem
+from tbmfg.state import NAV, ROT, Calibrated, Counts, Innovations, Result, Trajectory
+from tbmfg.timeseries import Floats
+
+UNOBSERVED = 0.9  # posterior over prior sd from which a calibration counts as not observed
+VAGUE_HEADING = np.deg2rad(10.0)
+
+
+def trajectory(problem: Problem, x: Floats, cov: Floats) -> Trajectory:
+    """States (n, 21 + e) and covariances (n, 15 + e, 15 + e) at the keyframes as a trajectory in n."""
+    return Trajectory(
+        t_ns=problem.t_ns,
+        position_n=x[:, 9:12] + problem.origin_n,
+        quat_xyzw=quat_from_matrix(x[:, :9].reshape(-1, 3, 3)),
+        velocity_n=x[:, 12:15].copy(),
+        bias_acc=x[:, 15:18].copy(),
+        bias_gyro=x[:, 18:21].copy(),
+        cov=np.ascontiguousarray(cov[:, :NAV, :NAV]),
+    )
+
+
+def result(
+    problem: Problem,
+    estimator: str,
+    x: Floats,
+    cov: Floats,
+    c: Floats,
+    c_cov: Floats,
+    nis: dict[str, Floats],
+    gated: dict[str, np.ndarray],
+) -> Result:
+    """What an estimator returns, from its states, calibrations ``c`` (m,) with covariance, and rows' NIS and gates."""
+    path = trajectory(problem, x, cov)
+    sd = np.sqrt(np.maximum(np.diag(c_cov), 0.0))
+    innovations = {
+        rows.sensor: Innovations(path.t_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
+        for rows in problem.rows
+    }
+    return Result(
+        estimator=estimator,
+        trajectory=path,
+        calibration={**problem.calibration, **calibrations(problem, c, sd), **_drifts(problem, x, cov)},
+        counts=_counts(problem, gated),
+        innovations=innovations,
+        intervals=list(problem.intervals),
+        warnings=[*_unobserved(problem, sd), *_vague_heading(path)],
+    )
+
+
+def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrated]:
+    """Parameters under their public names: vectors together, units in the name."""
+    names, free = problem.parameters.names, set(problem.parameters.free)
+    found: dict[str, Calibrated] = {}
+    for k, name in enumerate(names):
+        sensor, _, what = name.rpartition(".")
+        estimated = k in free
+        if what == "arm_x":
+            three = slice(k, k + 3)
+            found[f"{sensor}_lever_arm_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
+        elif what == "clock_offset":
+            found[f"{sensor}_clock_offset_s"] = Calibrated(c[k] + problem.clock_offset_s[sensor], sd[k], estimated)
+        elif what == "yaw":
+            degrees = np.rad2deg(c[k : k + 2]), np.rad2deg(sd[k : k + 2])
+            found[f"{sensor}_mounting_yaw_pitch_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
+        elif what == "declination":
+            found[f"{sensor}_declination_deg"] = Calibrated(np.rad2deg(c[k]), np.rad2deg(sd[k]), estimated)
+        elif what == "scale":
+            found[f"{sensor}_scale"] = Calibrated(c[k], sd[k], estimated)
+    return found
+
+
+def _drifts(problem: Problem, x: Floats, cov: Floats) -> dict[str, Calibrated]:
+    """Drifting calibrations at the last keyframe."""
+    last = np.sqrt(np.diag(cov[-1]))
+    return {
+        f"{name.replace('.', '_')}_m": Calibrated(x[-1, 21 + k], last[NAV + k], True)
+        for k, name in enumerate(problem.drift_names)
+    }
+
+
+def _counts(problem: Problem, gated: dict[str, np.ndarray]) -> dict[str, Counts]:
+    """Complete the counts: rows hold their samples, what is left over has not been used."""
+    counts = {name: copy(count) for name, count in problem.counts.items()}
+    for rows in problem.rows:
+        if rows.sensor in counts:
+            count = counts[rows.sensor]
+            count.gated = int(rows.samples[gated[rows.sensor]].sum())
+            count.used = int(rows.samples.sum()) - count.gated
+    return {
+        name: replace(count, unused=count.unused + count.received - count.parts()) for name, count in counts.items()
+    }
+
+
+def _unobserved(problem: Problem, sd: Floats) -> list[str]:
+    parameters = problem.parameters
+    return [
+        f"{parameters.names[k]} is not observable on this log: its sd stays {sd[k]:.3g} of the prior's {parameters.sd[k]:.3g}"
+        for k in parameters.free
+        if sd[k] > UNOBSERVED * parameters.sd[k]
+    ]
+
+
+def _vague_heading(path: Trajectory) -> list[str]:
+    """Say from when to when the heading is not known, and what would help."""
+    R = path.rotations()
+    up_b = R[:, 2, :]
+    sd = np.sqrt(np.einsum("ki,kij,kj->k", up_b, path.cov[:, ROT, ROT], up_b))
+    vague = sd > VAGUE_HEADING
+    if not vague.any():
+        return []
+    t = (path.t_ns - path.t_ns[0]) * 1e-9
+    span = t[vague]
+    return [
+        f"heading is known to {np.rad2deg(sd[vague].max()):.0f} deg only, {span[0]:.0f}-{span[-1]:.0f} s ({vague.mean():.0%} of the "
+        "keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by the prism would fix it"
+    ]

@@ -1,0 +1,124 @@
+"""Batch smoothing: Gauss-Newton over the whole log, damped when a step does not pay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from tbmfg.errors import EstimationError
+from tbmfg.inertial.strapdown import exp_rotation
+from tbmfg.problem import GATE, Problem
+from tbmfg.smoother import graph
+from tbmfg.smoother.chain import Block, Elimination, eliminate
+from tbmfg.smoother.graph import States
+from tbmfg.timeseries import Floats
+
+MAX_ITERATIONS = 30
+CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
+
+
+@dataclass(frozen=True, slots=True)
+class Smoothed:
+    """States (n, 21 + e) with covariances (n, 15 + e, 15 + e), calibrations with covariance; by sensor and row the
+    squared normalised residuals at the solution, and which of them lie beyond the gate."""
+
+    x: Floats
+    cov: Floats
+    c: Floats
+    c_cov: Floats
+    nis: dict[str, Floats]
+    gated: dict[str, np.ndarray]
+    iterations: int
+    converged: bool
+
+
+def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], None] | None = None) -> Smoothed:
+    """Most likely states and calibrations given all rows of ``problem``; starts from ``x`` (n, 21 + e) and ``c`` (m,).
+
+    Raises EstimationError when the unknowns are not determined.
+    """
+    free, n, d = problem.parameters.free, len(x), problem.size
+    m = len(free)
+    states = States(x.copy(), c.copy())
+    imu = graph.imu_graph(problem, states.x)
+    blocks, nis, cost = _linearise(problem, imu, states, free)
+    damping, converged, iteration = 0.0, False, 0
+    while iteration < MAX_ITERATIONS and not converged:
+        iteration += 1
+        chain = eliminate(blocks + _damping(blocks, damping, n, d, m), n, d, m)
+        _check(problem, chain)
+        dx, dc = chain.solve()
+        candidate = States(retract(states.x, dx), states.c.copy())
+        candidate.c[free] += dc
+        new_blocks, new_nis, new_cost = _linearise(problem, imu, candidate, free)
+        if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
+            converged = damping < 1e-6 and cost - new_cost < CONVERGED * 1e-3 * (1.0 + cost)
+            states, blocks, nis, cost = candidate, new_blocks, new_nis, new_cost
+            damping = 0.0 if damping < 1e-6 else damping * 0.1
+        else:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e8:
+                break
+        if progress is not None:
+            progress(iteration / (iteration + 3))
+    chain = eliminate(blocks, n, d, m)
+    cov, free_cov = chain.covariances()
+    c_cov = np.zeros((len(states.c), len(states.c)))
+    c_cov[np.ix_(free, free)] = free_cov
+    gated = {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+    return Smoothed(states.x, cov, states.c, c_cov, nis, gated, iteration, converged)
+
+
+def retract(x: Floats, dx: Floats) -> Floats:
+    """x (+) dx for all keyframes: (n, 21 + e), (n, 15 + e)."""
+    out = np.empty_like(x)
+    for k, (row, d) in enumerate(zip(x, dx, strict=True)):
+        out[k, :9] = (row[:9].reshape(3, 3) @ exp_rotation(d[:3])).ravel()
+    out[:, 9:] = x[:, 9:] + dx[:, 3:]
+    return out
+
+
+def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block], dict[str, Floats], float]:
+    """All whitened rows at ``states``, squared normalised residuals by sensor, and the cost."""
+    m, e = len(free), len(problem.drift_walk)
+    blocks = [graph.imu_block(imu, states.x, e, m), *graph.prior_blocks(problem, states, free)]
+    if e:
+        blocks.append(graph.drift_block(problem, states, m))
+    cost = 0.5 * sum(float(np.sum(block.b**2)) for block in blocks)
+    nis = {}
+    for rows in problem.rows:
+        block, nis[rows.sensor] = graph.sensor_block(rows, states, free)
+        blocks.append(block)
+        cost += graph.loss_cost(nis[rows.sensor], rows.loss, rows.dof)
+    return blocks, nis, cost
+
+
+def _damping(blocks: list[Block], damping: float, n: int, d: int, m: int) -> list[Block]:
+    """Levenberg-Marquardt rows sqrt(damping x diagonal of the information) dx = 0; Nocedal & Wright (2006) ch. 10.3."""
+    if damping == 0.0:
+        return []
+    diagonal = np.zeros((n, d))
+    for block in blocks:
+        np.add.at(diagonal, block.i, np.sum(block.A_i**2, axis=1))
+        if block.A_j is not None:
+            np.add.at(diagonal, block.i + 1, np.sum(block.A_j**2, axis=1))
+    A = np.sqrt(damping * diagonal)[:, :, None] * np.eye(d)
+    return [Block(np.arange(n), A, None, np.zeros((n, d, m)), np.zeros((n, d)))]
+
+
+def _check(problem: Problem, chain: Elimination) -> None:
+    """Explain a rank deficiency instead of dividing by zero."""
+    missing = chain.undetermined()
+    if not missing:
+        return
+    names = ("attitude", "position", "velocity", "accelerometer bias", "gyro bias", "drifting calibration")
+    free = [problem.parameters.names[k] for k in problem.parameters.free]
+    what = sorted({free[i] if k < 0 else names[min(i // 3, 5)] for k, i in missing})
+    times = [problem.keyframes_s[k] for k, _ in missing if k >= 0] or [problem.keyframes_s[-1]]
+    raise EstimationError(
+        f"not determined: {', '.join(what)}, {min(times):.1f}-{max(times):.1f} s ({len(missing)} unknowns); "
+        "add a sensor that sees it, or a prior in the rig (initial.*_sd, sensors.*.*_sd)"
+    )

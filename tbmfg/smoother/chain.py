@@ -1,0 +1,206 @@
+"""Least squares over a chain of keyframes with a border of constants, and all its covariances, in linear time.
+
+The unknowns are x_0 .. x_{n-1} (d each) and c (m). Every row touches one keyframe or two neighbours, and c. The
+keyframes are eliminated in time order by Householder QR, a square-root information filter; going back gives the
+solution and the covariance of every keyframe: Bierman (1977) ch. V; Kaess & Dellaert (2009) eqs. 5-6 for a chain. QR
+keeps what normal equations lose: a gyro bias walk of 1e-9 beside a prior of 1 spans more than double precision squared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from tbmfg.timeseries import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Rows A_i dx_i + A_j dx_j + A_c dc = b of one kind: ``i`` (n,), A_i (n, k, d), A_j likewise or None for rows on
+    keyframe i alone (else j = i + 1), A_c (n, k, m), b (n, k)."""
+
+    i: np.ndarray
+    A_i: Floats
+    A_j: Floats | None
+    A_c: Floats
+    b: Floats
+
+
+def assemble(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, np.ndarray, Floats, np.ndarray]:
+    """Rows on one keyframe [x_i, c, b] and on two [x_i, x_j, c, b], sorted by i, with the start of each i's rows."""
+    out: list = []
+    for binary in (False, True):
+        chosen = [blk for blk in blocks if (blk.A_j is not None) == binary and len(blk.i)]
+        width = (2 * d if binary else d) + m + 1
+        parts, owner = [np.zeros((0, width))], [np.zeros(0, dtype=int)]
+        for blk in chosen:
+            states = (blk.A_i, blk.A_j) if binary else (blk.A_i,)
+            rows = np.concatenate([*states, blk.A_c, blk.b[:, :, None]], axis=2)
+            parts.append(rows.reshape(-1, width))
+            owner.append(np.repeat(blk.i, blk.b.shape[1]))
+        flat, by = np.concatenate(parts), np.concatenate(owner)
+        order = np.argsort(by, kind="stable")
+        out += [flat[order], np.searchsorted(by[order], np.arange(n + 1))]
+    return out[0], out[1], out[2], out[3]
+
+
+@njit(cache=True)
+def _triangularise(W: np.ndarray, rows: int, columns: int) -> None:
+    """Householder QR of W[:rows, :columns] in place; reflections act on all columns, the sign of R's diagonal is free."""
+    width = W.shape[1]
+    w = np.empty(width)
+    for j in range(min(columns, rows)):
+        square = 0.0
+        for i in range(j, rows):
+            square += W[i, j] * W[i, j]
+        if square == 0.0:
+            continue
+        alpha = -np.sqrt(square) if W[j, j] > 0 else np.sqrt(square)
+        v0 = W[j, j] - alpha
+        beta = -1.0 / (alpha * v0)  # 2 / |v|^2
+        for q in range(j + 1, width):
+            w[q] = v0 * W[j, q]
+        for i in range(j + 1, rows):
+            a = W[i, j]
+            if a != 0.0:
+                for q in range(j + 1, width):
+                    w[q] += a * W[i, q]
+        for q in range(j + 1, width):
+            w[q] *= beta
+            W[j, q] -= v0 * w[q]
+        for i in range(j + 1, rows):
+            a = W[i, j]
+            if a != 0.0:
+                for q in range(j + 1, width):
+                    W[i, q] -= a * w[q]
+                W[i, j] = 0.0
+        W[j, j] = alpha
+
+
+@njit(cache=True)
+def _eliminate(U, u_start, B, b_start, n, d, m):
+    """Conditionals [R_k, S_next, S_c, rhs] (n, d, 2 d + m + 1), and the triangle [R_c, rhs] (m, m + 1) of c."""
+    width = 2 * d + m + 1
+    out = np.zeros((n, d, width))
+    carry = np.zeros((d + m, d + m + 1))  # what the past says about [x_k, c]
+    most = 0
+    for k in range(n):
+        most = max(most, u_start[k + 1] - u_start[k] + b_start[k + 1] - b_start[k])
+    W = np.empty((2 * (d + m) + most, width))
+    for k in range(n - 1):
+        rows = d + m
+        W[:, :] = 0.0
+        W[:rows, :d] = carry[:, :d]
+        W[:rows, 2 * d :] = carry[:, d:]
+        for u in range(u_start[k], u_start[k + 1]):
+            W[rows, :d] = U[u, :d]
+            W[rows, 2 * d :] = U[u, d:]
+            rows += 1
+        for b in range(b_start[k], b_start[k + 1]):
+            W[rows] = B[b]
+            rows += 1
+        _triangularise(W, rows, width - 1)
+        out[k] = W[:d]
+        carry[:, :] = W[d : 2 * d + m, d:]
+    last = np.zeros((d + m + most, d + m + 1))
+    last[: d + m] = carry
+    rows = d + m
+    for u in range(u_start[n - 1], u_start[n]):
+        last[rows] = U[u]
+        rows += 1
+    _triangularise(last, rows, d + m)
+    out[n - 1, :, :d] = last[:d, :d]
+    out[n - 1, :, 2 * d :] = last[:d, d:]
+    return out, last[d : d + m, d:].copy()
+
+
+@njit(cache=True)
+def _upper_solve(R, Y):
+    """R^-1 Y for upper triangular R (d, d) and Y (d, q)."""
+    d, q = Y.shape
+    X = Y.copy()
+    for i in range(d - 1, -1, -1):
+        for j in range(i + 1, d):
+            a = R[i, j]
+            for p in range(q):
+                X[i, p] -= a * X[j, p]
+        a = 1.0 / R[i, i]
+        for p in range(q):
+            X[i, p] *= a
+    return X
+
+
+@njit(cache=True)
+def _back(conditionals, border, n, d, m):
+    """Solution x (n, d), c (m) by back-substitution."""
+    c = _upper_solve(border[:, :m], border[:, m:])[:, 0]
+    x = np.zeros((n + 1, d))
+    for k in range(n - 1, -1, -1):
+        row = conditionals[k]
+        y = row[:, 2 * d + m].copy()
+        for i in range(d):
+            for j in range(d):
+                y[i] -= row[i, d + j] * x[k + 1, j]
+            for j in range(m):
+                y[i] -= row[i, 2 * d + j] * c[j]
+        x[k] = _upper_solve(row[:, :d], y.reshape(d, 1))[:, 0]
+    return x[:n], c
+
+
+@njit(cache=True)
+def _covariances(conditionals, border, n, d, m):
+    """Covariance of every x_k (n, d, d) and of c (m, m).
+
+    With x_k = R^-1 (y - S [x_next; c]) and J = cov [x_next; c]: cov x_k = R^-1 R^-T + G J G^T and
+    cov(x_k, [x_next; c]) = -G J, G = R^-1 S.
+    """
+    out = np.zeros((n, d, d))
+    inverse = _upper_solve(border[:, :m], np.eye(m))
+    J = np.zeros((d + m, d + m))
+    J[d:, d:] = inverse @ inverse.T
+    for k in range(n - 1, -1, -1):
+        row = conditionals[k]
+        inverse = _upper_solve(row[:, :d], np.eye(d))
+        G = inverse @ row[:, d : 2 * d + m]
+        GJ = G @ J
+        cov = inverse @ inverse.T + GJ @ G.T
+        out[k] = 0.5 * (cov + cov.T)
+        J[:d, :d] = out[k]
+        J[:d, d:] = -GJ[:, d:]
+        J[d:, :d] = -GJ[:, d:].T
+    return out, J[d:, d:].copy()
+
+
+@dataclass(frozen=True, slots=True)
+class Elimination:
+    """An eliminated chain: solves, and gives covariances."""
+
+    conditionals: Floats
+    border: Floats
+    n: int
+    d: int
+    m: int
+
+    def solve(self) -> tuple[Floats, Floats]:
+        """x (n, d) and c (m,) of least squares."""
+        return _back(self.conditionals, self.border, self.n, self.d, self.m)
+
+    def covariances(self) -> tuple[Floats, Floats]:
+        """Marginal covariances: (n, d, d) of the keyframes and (m, m) of the constants."""
+        return _covariances(self.conditionals, self.border, self.n, self.d, self.m)
+
+    def undetermined(self) -> list[tuple[int, int]]:
+        """Unknowns that no row determines: (keyframe, index), keyframe -1 for a constant."""
+        diagonal = np.einsum("kii->ki", self.conditionals[:, :, : self.d])
+        found = [(int(k), int(i)) for k, i in np.argwhere(~(np.abs(diagonal) > 1e-12))]
+        border = np.diagonal(self.border[:, : self.m])
+        return found + [(-1, int(i)) for i in np.flatnonzero(~(np.abs(border) > 1e-12))]
+
+
+def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
+    """Eliminate n keyframes of dimension d with a border of m constants; blocks in any order."""
+    U, u_start, B, b_start = assemble(blocks, n, d, m)
+    conditionals, border = _eliminate(U, u_start, B, b_start, n, d, m)
+    return Elimination(conditionals, border, n, d, m)

@@ -1,0 +1,155 @@
+"""The factor graph of a problem: IMU factors in GTSAM, every other sensor through its shared model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from scipy.stats import chi2
+
+from tbmfg.inertial.steps import step_index
+from tbmfg.problem import Problem
+from tbmfg.sensors import Rows
+from tbmfg.smoother.chain import Block
+from tbmfg.state import NAV, POS
+from tbmfg.timeseries import Floats
+
+INTEGRATION_PSD = 1e-12  # m^2/s: keeps a one-sample interval's covariance regular, far below any sensor
+# columns of a CombinedImuFactor's Jacobian (pose, velocity at i; at j; bias at i; at j) in our order
+COLUMNS = np.r_[0:9, 18:24, 9:18, 24:30]
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """Keyframe states ``x`` (n, 21 + e) and constant calibrations ``c``."""
+
+    x: Floats
+    c: Floats
+
+
+def imu_graph(problem: Problem, x: Floats) -> gtsam.NonlinearFactorGraph:
+    """CombinedImuFactor between neighbours, preintegrated at the biases of ``x``; samples are cut at keyframes."""
+    inertial, steps, t = problem.inertial, problem.inertial.steps, problem.keyframes_s
+    base = _parameters(problem, 0.0, 0.0)
+    typical = inertial.psd_gyro.min(), inertial.psd_acc.min()
+    graph = gtsam.NonlinearFactorGraph()
+    first, last = step_index(steps, t[:-1] + 1e-9), step_index(steps, t[1:] - 1e-9)
+    for k in range(len(t) - 1):
+        rows = slice(first[k], last[k] + 1)
+        dt = np.diff(np.concatenate([[t[k]], steps.edges_s[first[k] + 1 : last[k] + 1], [t[k + 1]]]))
+        # steps that stand in for lost samples: their extra noise, spread over the interval
+        extra_gyro = float(np.sum((inertial.psd_gyro[rows] - typical[0]) * dt) / (t[k + 1] - t[k]))
+        extra_acc = float(np.sum((inertial.psd_acc[rows] - typical[1]) * dt) / (t[k + 1] - t[k]))
+        plain = extra_gyro <= 0.0 and extra_acc <= 0.0
+        parameters = base if plain else _parameters(problem, extra_gyro, extra_acc)
+        pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(x[k, 15:18], x[k, 18:21]))
+        for acc, gyro, step in zip(inertial.acc[rows], inertial.gyro[rows], dt, strict=True):
+            pim.integrateMeasurement(acc, gyro, step)
+        graph.add(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), pim))
+    return graph
+
+
+def _parameters(problem: Problem, extra_gyro: float, extra_acc: float) -> gtsam.PreintegrationCombinedParams:
+    inertial = problem.inertial
+    p = gtsam.PreintegrationCombinedParams(inertial.gravity_n)
+    p.setGyroscopeCovariance(np.eye(3) * (inertial.psd_gyro.min() + extra_gyro))
+    p.setAccelerometerCovariance(np.eye(3) * (inertial.psd_acc.min() + extra_acc))
+    p.setIntegrationCovariance(np.eye(3) * INTEGRATION_PSD)
+    p.setBiasAccCovariance(np.eye(3) * inertial.psd_ba)
+    p.setBiasOmegaCovariance(np.eye(3) * inertial.psd_bg)
+    if np.any(inertial.earth_n):
+        p.setOmegaCoriolis(inertial.earth_n)
+    return p
+
+
+def values(x: Floats) -> gtsam.Values:
+    """GTSAM values of the keyframe states."""
+    out = gtsam.Values()
+    for k, row in enumerate(x):
+        out.insert(X(k), gtsam.Pose3(gtsam.Rot3(row[:9].reshape(3, 3)), row[9:12]))
+        out.insert(V(k), row[12:15])
+        out.insert(B(k), gtsam.imuBias.ConstantBias(row[15:18], row[18:21]))
+    return out
+
+
+def imu_block(graph: gtsam.NonlinearFactorGraph, x: Floats, e: int, m: int) -> Block:
+    """The IMU factors linearised at ``x``, whitened, in our chart (position in n; GTSAM has it in b)."""
+    linear = graph.linearize(values(x))
+    n = graph.size()
+    A, b = np.empty((n, 15, 30)), np.empty((n, 15))
+    for k in range(n):
+        factor = linear.at(k)
+        A[k], b[k] = factor.getA(), factor.getb()
+    A = A[:, :, COLUMNS]
+    R = x[:, :9].reshape(-1, 3, 3)
+    sides = []
+    for side, rotation in ((A[:, :, :15], R[:-1]), (A[:, :, 15:], R[1:])):
+        side[:, :, POS] = side[:, :, POS] @ rotation.transpose(0, 2, 1)
+        sides.append(np.concatenate([side, np.zeros((n, 15, e))], axis=2))
+    return Block(np.arange(n), sides[0], sides[1], np.zeros((n, 15, m)), b)
+
+
+def sensor_block(rows: Rows, states: States, free: np.ndarray) -> tuple[Block, Floats]:
+    """A sensor's rows linearised and weighted by their loss, and their squared normalised residuals (n,)."""
+    r, Ji, Jj, Jc = rows.evaluate(states.x, states.c)
+    nis = np.sum(r**2, axis=1)
+    root = np.sqrt(weight(nis, rows.loss, rows.dof))[:, None]
+    A_c = np.zeros((len(r), r.shape[1], len(states.c)))
+    A_c[:, :, rows.calib] = Jc
+    binary = Jj.shape[2] > 0
+    scaled = root[:, :, None]
+    return Block(rows.i, Ji * scaled, Jj * scaled if binary else None, A_c[:, :, free] * scaled, -r * root), nis
+
+
+def drift_block(problem: Problem, states: States, m: int) -> Block:
+    """Random walk of the drifting calibrations between neighbours."""
+    n, d, e = len(states.x) - 1, problem.size, len(problem.drift_walk)
+    sigma = np.maximum(problem.drift_walk * np.sqrt(np.diff(problem.keyframes_s))[:, None], 1e-9)
+    A_i, A_j = np.zeros((n, e, d)), np.zeros((n, e, d))
+    which = np.arange(e)
+    A_i[:, which, NAV + which], A_j[:, which, NAV + which] = -1.0 / sigma, 1.0 / sigma
+    b = -(states.x[1:, 21:] - states.x[:-1, 21:]) / sigma
+    return Block(np.arange(n), A_i, A_j, np.zeros((n, e, m)), b)
+
+
+def prior_blocks(problem: Problem, states: States, free: np.ndarray) -> list[Block]:
+    """Prior of the first state and of the free calibrations, whitened."""
+    from tbmfg.geometry import log_so3
+
+    d, m = problem.size, len(free)
+    x, x0 = states.x[0], problem.prior.x
+    error = np.concatenate([log_so3(x0[:9].reshape(3, 3).T @ x[:9].reshape(3, 3)), x[9:] - x0[9:]])
+    whiten = np.linalg.inv(np.linalg.cholesky(problem.prior.cov))
+    first = np.zeros(1, dtype=int)
+    state = Block(first, whiten[None], None, np.zeros((1, d, m)), -(whiten @ error)[None])
+    sd = problem.parameters.sd[free]
+    deviation = (states.c[free] - problem.parameters.mean[free]) / sd
+    constants = Block(first, np.zeros((1, m, d)), None, np.diag(1.0 / sd)[None], -deviation[None])
+    return [state, constants]
+
+
+def threshold(dof: int) -> float:
+    """Normalised residual from which a loss departs from the square: 95 % of good rows lie below."""
+    return float(np.sqrt(chi2.ppf(0.95, dof)))
+
+
+def weight(nis: Floats, loss: str, dof: int) -> Floats:
+    """IRLS weight of rows with squared normalised residual ``nis``."""
+    if loss == "none":
+        return np.ones_like(nis)
+    k, s = threshold(dof), np.sqrt(nis)
+    if loss == "huber":
+        return k / np.maximum(s, k)
+    return 1.0 / (1.0 + nis / k**2)
+
+
+def loss_cost(nis: Floats, loss: str, dof: int) -> float:
+    """Sum of the losses: half the square where a row is good."""
+    if loss == "none":
+        return 0.5 * float(nis.sum())
+    k, s = threshold(dof), np.sqrt(nis)
+    if loss == "huber":
+        return float(np.sum(np.where(s < k, 0.5 * nis, k * s - 0.5 * k**2)))
+    return float(np.sum(0.5 * k**2 * np.log1p(nis / k**2)))
