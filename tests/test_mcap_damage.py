@@ -187,6 +187,17 @@ def test_a_damaged_summary_is_not_used(path, written):
     assert "summary" in log.damage[0]
 
 
+def test_a_damaged_summary_without_a_checksum(path, written):
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"zstd")  # in the last chunk index, whose own length then runs over its end
+    data[at - 4 : at] = struct.pack("<I", 10**6)
+    data[-12:-8] = bytes(4)
+    path.write_bytes(data)
+    log = read_log(path)
+    assert assert_part_of(log, written) == 250
+    assert log.damage[0].startswith("x.mcap: the index of a chunk cannot be read")
+
+
 # ---- outside chunks ----
 
 

@@ -5,7 +5,7 @@ import pytest
 from mcap_samples import START_NS, data, sample
 
 from tbmfg.mcap import describe, info_text, write_log
-from tbmfg.mcap.info import Gap, clock_problems, guess_role
+from tbmfg.mcap.info import Gap, clock_problems, guess_role, unit_problems
 from tbmfg.timeseries import NS, Series, StreamCounts, Transform
 
 IMU, POINT = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PointStamped"
@@ -153,6 +153,30 @@ def test_text_lists_transforms_attachments_and_damage(tmp_path):
     assert "rig.yaml: 5 bytes" in text
     assert "skipped: " in text
     assert "/tf_static" in text
+
+
+@pytest.mark.parametrize(
+    ("type", "column", "size", "said"),
+    [
+        (IMU, "acc", 1.0, "in g"),
+        ("sensor_msgs/msg/MagneticField", "field", 0.48, "in gauss"),
+        ("sensor_msgs/msg/MagneticField", "field", 48.0, "in microtesla"),
+        ("sensor_msgs/msg/FluidPressure", "pressure", 101.3, "in kPa"),
+        ("sensor_msgs/msg/FluidPressure", "pressure", 1013.0, "in hPa"),
+        (IMU, "acc", 9.8, ""),
+        ("sensor_msgs/msg/MagneticField", "field", 48e-6, ""),
+        ("sensor_msgs/msg/FluidPressure", "pressure", 101_300.0, ""),
+    ],
+)
+def test_wrong_units(type, column, size, said):
+    series = sample(type, 30)
+    values = series[column].reshape(30, -1)
+    series.columns[column] = (size * values / np.linalg.norm(values, axis=1, keepdims=True)).reshape(
+        series[column].shape
+    )
+    problems = unit_problems(series)
+    assert len(problems) == bool(said)
+    assert said in "".join(problems)
 
 
 # ---- clocks ----

@@ -256,10 +256,10 @@ def test_angular_rate_of_a_constant_turn():
     np.testing.assert_allclose(twist[:, 3:], np.tile(omega_b, (n, 1)), atol=1e-9)
 
 
-def test_an_hour_of_keyframes_is_written_in_seconds(tmp_path):
+def test_twenty_minutes_of_keyframes_are_written_in_a_second_or_two(tmp_path):
     start = time.perf_counter()
-    write_trajectory(tmp_path / "x.mcap", trajectory(36_000))
-    assert time.perf_counter() - start < 10  # about 1.5 s on an idle core
+    write_trajectory(tmp_path / "x.mcap", trajectory(12_000))
+    assert time.perf_counter() - start < 4  # about 0.5 s on an idle core
 
 
 def test_child_frames_are_those_of_the_samples():
