@@ -119,7 +119,8 @@ def decode(layout: Layout, payloads: Sequence[bytes]) -> Rows:
             dtype, fixed, names = _place(layout, block[0].tobytes())
             alike = (block[:, fixed] == block[0, fixed]).all(axis=1)
             if dtype is not None:
-                _fill(block[alike].view(dtype)[:, 0], rows[alike], t_ns, columns)
+                messages = block if alike.all() else block[alike]
+                _fill(messages.view(dtype)[:, 0], rows[alike], t_ns, columns)
                 good[rows[alike]] = True
                 strings = strings or names
             rows, block = rows[~alike], block[~alike]

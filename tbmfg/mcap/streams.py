@@ -19,7 +19,7 @@ from tbmfg.timeseries import Floats, Series, StreamCounts, Times, Transform
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 Entries = list[tuple[int, int, int]]  # of messages in a block: log time, first and past-the-last byte
 
-_BATCH_BYTES = 4 << 20  # raw messages held back until they are decoded together
+_BATCH_BYTES = 2 << 20  # raw messages held back until they are decoded together
 _UNIT_NORM = 0.01  # a quaternion further than this from norm 1 was never filled in
 
 
