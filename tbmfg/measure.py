@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from tbmfg.earth import north_direction
+from tbmfg.geometry import exp_so3, rotation_from_rpy
 from tbmfg.inertial.steps import Steps, step_index
 from tbmfg.rig import Barometer, Keyframes, Magnetometer, Odometer, PositionSensor
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
 
-SHARED_S = 1e-3  # stamps this close share a keyframe
+SMOOTHED_S = 4.0  # the speed that an odometer's scale is judged on is a mean over this time
 RATE_WINDOW_S = 0.02  # the angular rate at a fix is a mean over this much on either side
 
 
@@ -25,21 +26,25 @@ class Samples:
     values: Floats
 
 
-def keyframe_times(rule: Keyframes, start_s: float, end_s: float, fixes_s: Floats) -> Floats:
-    """Keyframe times: the span's ends, every fix (at most ``max_rate_hz``), and what fills gaps to ``max_gap_s``."""
-    wanted = np.unique(np.concatenate([[start_s], fixes_s[(fixes_s > start_s) & (fixes_s < end_s)], [end_s]]))
-    closest = max(SHARED_S, (1 - 1e-6) / rule.max_rate_hz)
-    if np.any(np.diff(wanted) < closest):
-        kept = [wanted[0]]
-        for t in wanted[1:-1]:
-            if t - kept[-1] >= closest:
-                kept.append(t)
-        if end_s - kept[-1] < SHARED_S and len(kept) > 1:
-            kept.pop()
-        wanted = np.array([*kept, end_s])
-    parts = np.maximum(np.ceil(np.diff(wanted) / rule.max_gap_s - 1e-9).astype(int), 1)
-    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(wanted[:-1], wanted[1:], parts, strict=True)]
-    return np.concatenate([*pieces, wanted[-1:]])
+def keyframe_edges(rule: Keyframes, edges_s: Floats, end_s: float, fixes_s: Floats) -> np.ndarray:
+    """IMU edges at which the keyframes lie, int64 (n,): the span's ends, the edge nearest to every fix (at most
+    ``max_rate_hz``), and what fills gaps to ``max_gap_s``.
+
+    On edges no IMU sample is cut, and what is left between a fix and its keyframe, half an IMU period at most, is
+    bridged by the velocity. A vibrating body moves too fast inside a sample to be interpolated there.
+    """
+    last = int(nearest(edges_s, np.array([end_s]))[0])
+    closest = (1 - 1e-6) / rule.max_rate_hz
+    inside = fixes_s[(fixes_s > edges_s[0]) & (fixes_s < edges_s[last])]
+    kept = [0]
+    for k in np.unique(nearest(edges_s, inside)):
+        if edges_s[k] - edges_s[kept[-1]] >= closest:
+            kept.append(int(k))
+    if kept[-1] != last:
+        kept.append(last)
+    parts = np.maximum(np.ceil(np.diff(edges_s[kept]) / rule.max_gap_s - 1e-9).astype(int), 1)
+    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(kept[:-1], kept[1:], parts, strict=True)]
+    return np.unique(np.concatenate([*pieces, [last]]).astype(int))
 
 
 def nearest(keyframes_s: Floats, t_s: Floats) -> np.ndarray:
@@ -59,8 +64,6 @@ class GyroFrame:
 
     def at(self, t_s: Floats) -> Floats:
         """R_0b at any time, (n, 3, 3): the attitude at the step's start, turned at the step's rate."""
-        from tbmfg.geometry import exp_so3
-
         k = step_index(self.steps, t_s)
         return self.R_0t[k] @ exp_so3(self.gyro[k] * (t_s - self.steps.edges_s[k])[:, None])
 
@@ -104,28 +107,27 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
     k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)
     covered = (middle > starts[k] - 0.01 * period) & (middle <= ends[k])
     v = np.where(covered, speeds.values[k], 0.0)
+    smooth = _running_mean(speeds.values, round(SMOOTHED_S / period))[k]
 
-    R_mid = frame.at(middle)
-    travel = v * steps.dt
-    M = _cumulative(R_mid * travel[:, None, None])
-    sweep = _cumulative(R_mid[:, :, 0] * (travel * middle)[:, None])
-    cover = _cumulative(covered * steps.dt)
-    edges = [_interpolate(steps.edges_s, values, keyframes_s) for values in (M, sweep, cover)]
-    dM, dsweep, dcover = (np.diff(values, axis=0) for values in edges)
+    E = rotation_from_rpy(np.array([0.0, sensor.pitch, sensor.yaw]))
+    ahead = frame.at(middle) @ E[:, 0]
+    way, smoothed = (ahead * (speed * steps.dt)[:, None] for speed in (v, smooth))
+    sums = [_cumulative(values) for values in (way, smoothed, way * middle[:, None], covered * steps.dt)]
+    way, smoothed, sweep, cover = (
+        np.diff(_interpolate(steps.edges_s, values, keyframes_s), axis=0) for values in sums
+    )
 
-    R_i = frame.at(keyframes_s[:-1]).transpose(0, 2, 1)
-    dsweep = dsweep - dM[:, :, 0] * keyframes_s[:-1, None]
     length = np.diff(keyframes_s)
-    i = np.flatnonzero(dcover > 0.999 * length - 1e-9)
-    turned_M = (R_i @ dM)[i].reshape(-1, 9)
-    B = np.einsum("kij,kj->ki", R_i, dsweep)[i]
-    constant = np.tile(sensor.arm, (len(i), 1)), np.tile(frame.bias_gyro, (len(i), 1))
-    data = np.column_stack([turned_M, constant[0], B, constant[1]])
+    i = np.flatnonzero(cover > 0.999 * length - 1e-9)
+    R_i = frame.at(keyframes_s[i])
+    D, D_smooth = (np.einsum("kji,kj->ki", R_i, values[i]) @ E for values in (way, smoothed))
+    B = np.einsum("kji,kj->ki", R_i, sweep[i] - way[i] * keyframes_s[i, None])
+    data = np.column_stack([np.tile(sensor.arm, (len(i), 1)), B, np.tile(frame.bias_gyro, (len(i), 1)), D_smooth])
     # white noise per sample of one period: over a time T it leaves a displacement of sigma sqrt(period T)
     per_sample = np.array([sensor.sigma, sensor.lateral_sigma, sensor.lateral_sigma])
     sigma = per_sample * np.sqrt(period * length[i])[:, None]
     samples = np.searchsorted(ends, keyframes_s[i + 1] + 1e-9) - np.searchsorted(ends, keyframes_s[i] + 1e-9)
-    return Rows(speeds.sensor, "odometer", i, i + 1, np.zeros((len(i), 0)), data, sigma, calib, samples, sensor.loss)
+    return Rows(speeds.sensor, "odometer", i, i + 1, D, data, sigma, calib, samples, sensor.loss)
 
 
 def magnetometer_rows(
@@ -178,6 +180,12 @@ def _group(k: np.ndarray, values: Floats) -> tuple[np.ndarray, Floats, np.ndarra
     total = np.zeros((len(used), values.shape[1]))
     np.add.at(total, inverse, values)
     return used, total / count[:, None], count
+
+
+def _running_mean(values: Floats, count: int) -> Floats:
+    """Mean of ``count`` samples centred on each; fewer at the ends."""
+    window = np.ones(min(max(count, 1), len(values)))
+    return np.convolve(values, window, "same") / np.convolve(np.ones(len(values)), window, "same")
 
 
 def _cumulative(values: Floats) -> Floats:

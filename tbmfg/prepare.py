@@ -308,9 +308,9 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
     parameters = replace(setup.parameters, mean=mean, start=begin)
 
     fixes = [s.t_s - offsets[name] for name, s in samples.items() if _is_position(rig, name)]
-    keyframes = measure.keyframe_times(
-        rig.keyframes, float(steps.edges_s[0]), end_s, np.sort(np.concatenate(fixes)) if fixes else np.zeros(0)
-    )
+    fixes_s = np.sort(np.concatenate(fixes)) if fixes else np.zeros(0)
+    edges = measure.keyframe_edges(rig.keyframes, steps.edges_s, end_s, fixes_s)
+    keyframes = steps.edges_s[edges]
     rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
     for name, s in samples.items():
         sensor, calib = rig.sensors[name], parameters.slice(name)
@@ -346,7 +346,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
     x = np.concatenate([setup.R_start.ravel(), position, velocity, np.zeros(3), setup.bias_gyro, drift])
     prior = _prior(setup, x, np.array(drift_sd), bool(fixes))
     return Problem(
-        rig, inertial, keyframes, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
+        rig, inertial, edges, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
         dict(offsets), setup.counts, {}, [], setup.warnings,
     )  # fmt: skip
 

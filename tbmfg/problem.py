@@ -76,13 +76,14 @@ class Prior:
 class Problem:
     """See the fields. Positions are relative to ``origin_n``, times in s since ``steps.t0_ns``.
 
+    ``keyframe_edges`` (n,) are the IMU edges at which the keyframes lie.
     ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
     ``clock_offset_s`` the offsets that the rows were placed with.
     """
 
     rig: Rig
     inertial: Inertial
-    keyframes_s: Floats
+    keyframe_edges: np.ndarray
     rows: list[Rows]
     parameters: Parameters
     drift_names: tuple[str, ...]
@@ -99,6 +100,11 @@ class Problem:
     def t0_ns(self) -> int:
         """Stamp of the first IMU sample: the zero of all seconds."""
         return self.inertial.steps.t0_ns
+
+    @property
+    def keyframes_s(self) -> Floats:
+        """Times of the keyframes, (n,)."""
+        return self.inertial.steps.edges_s[self.keyframe_edges]
 
     @property
     def t_ns(self) -> Times:

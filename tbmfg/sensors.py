@@ -81,46 +81,47 @@ def prism(z, data, xi, xj, c):
 
 @njit(cache=True)
 def odometer(z, data, xi, xj, c):
-    """Displacement of the contact point over an interval, in b at its start.
+    """Displacement of the contact point over an interval, in the wheel's axes at its start.
 
-    z (0). data (18): M (9) = sum R_i^T R(t) v dt over the indicated speed v, the contact point's arm in b (3),
-    B (3) = sum R_i^T R(t) e_x v (t - t_i) dt, gyro bias that M was computed with (3).
-    c (3): scale, mounting yaw and pitch of the wheel's direction [rad].
-    h = R_i^T (p_j + R_j l - p_i) - l - (M e + [B]x (b_g - b_0)) / (1 + scale), measured as zero;
-    e = (cos yaw cos pitch, sin yaw cos pitch, -sin pitch). No sliding sideways, no lifting.
+    z (3): D = sum E^T R_i^T R(t) E e_x v dt over the indicated speed v. data (12): the contact point's arm l in b,
+    B = sum R_i^T R(t) E e_x v (t - t_i) dt, the gyro bias b_0 that both were computed with, and D~, which is D with
+    the speed smoothed over seconds. c (3): scale s, mounting yaw and pitch [rad], E = Rz(yaw) Ry(pitch).
+    h = E^T (u - [B]x (b_g - b_0)) + s / (1 + s) D~, u = R_i^T (p_j + R_j l - p_i) - l; no sliding sideways, no
+    lifting. Multiplied onto u or D instead, the body's vibration or the odometer's noise would pass for scale (errors in
+    variables); D~ holds next to nothing of either.
     """
-    n, d = len(data), xi.shape[1] - 6
+    n, d = len(z), xi.shape[1] - 6
     r, Ji, Jj, Jc = np.empty((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, d)), np.zeros((n, 3, 3))
     cy, sy, cp, sp = np.cos(c[1]), np.sin(c[1]), np.cos(c[2]), np.sin(c[2])
-    e = np.array([cy * cp, sy * cp, -sp])
-    e_yaw, e_pitch = np.array([-sy * cp, cy * cp, 0.0]), np.array([-cy * sp, -sy * sp, -cp])
-    inverse = 1.0 / (1.0 + c[0])
+    Et = np.array([[cy * cp, sy * cp, -sp], [-sy, cy, 0.0], [cy * sp, sy * sp, cp]])
+    Et_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
+    Et_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
+    share = c[0] / (1.0 + c[0])
     for k in range(n):
-        x, y, M, arm, B = xi[k], xj[k], data[k, :9].reshape(3, 3), data[k, 9:12], data[k, 12:15]
-        step = _unrotate(x, y[9:12] + _rotate(y, arm) - x[9:12])
-        bias = x[18:21] - data[k, 15:18]
-        drift = np.array(
-            [B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]]
-        )
+        x, y, arm, B = xi[k], xj[k], data[k, :3], data[k, 3:6]
+        whole = _unrotate(x, y[9:12] + _rotate(y, arm) - x[9:12])
+        bias = x[18:21] - data[k, 6:9]
+        drift = np.array([B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]])
+        way = whole - arm - drift
+        turn_i = np.array([[0.0, -whole[2], whole[1]], [whole[2], 0.0, -whole[0]], [-whole[1], whole[0], 0.0]])
+        skew_B = np.array([[0.0, -B[2], B[1]], [B[2], 0.0, -B[0]], [-B[1], B[0], 0.0]])
+        turn_n, turn_j = np.zeros((3, 3)), np.zeros((3, 3))
+        _add_minus_R_skew(turn_n, y, arm, 1.0)
+        for b in range(3):
+            turn_j[:, b] = _unrotate(x, turn_n[:, b])
         for a in range(3):
-            travelled = M[a, 0] * e[0] + M[a, 1] * e[1] + M[a, 2] * e[2] + drift[a]
-            r[k, a] = step[a] - arm[a] - travelled * inverse
-            Jc[k, a, 0] = travelled * inverse * inverse
-            Jc[k, a, 1] = -inverse * (M[a, 0] * e_yaw[0] + M[a, 1] * e_yaw[1] + M[a, 2] * e_yaw[2])
-            Jc[k, a, 2] = -inverse * (M[a, 0] * e_pitch[0] + M[a, 1] * e_pitch[1] + M[a, 2] * e_pitch[2])
-            for b in range(3):
-                Ji[k, a, 3 + b] = -x[3 * b + a]
-                Jj[k, a, 3 + b] = x[3 * b + a]
-        # d(R_i^T u)/d_rot_i = [R_i^T u]x
-        Ji[k, 0, 1], Ji[k, 0, 2], Ji[k, 1, 2] = -step[2], step[1], -step[0]
-        Ji[k, 1, 0], Ji[k, 2, 0], Ji[k, 2, 1] = step[2], -step[1], step[0]
-        Ji[k, 0, 13], Ji[k, 0, 14], Ji[k, 1, 14] = inverse * B[2], -inverse * B[1], inverse * B[0]
-        Ji[k, 1, 12], Ji[k, 2, 12], Ji[k, 2, 13] = -inverse * B[2], inverse * B[1], -inverse * B[0]
-        turn = np.zeros((3, 3))
-        _add_minus_R_skew(turn, y, arm, 1.0)
-        for a in range(3):
-            for b in range(3):
-                Jj[k, a, b] = x[a] * turn[0, b] + x[3 + a] * turn[1, b] + x[6 + a] * turn[2, b]
+            r[k, a] = share * data[k, 9 + a] - z[k, a]
+            Jc[k, a, 0] = data[k, 9 + a] / (1.0 + c[0]) ** 2
+            for q in range(3):
+                r[k, a] += Et[a, q] * way[q]
+                Jc[k, a, 1] += Et_yaw[a, q] * way[q]
+                Jc[k, a, 2] += Et_pitch[a, q] * way[q]
+                for b in range(3):
+                    Ji[k, a, b] += Et[a, q] * turn_i[q, b]
+                    Jj[k, a, b] += Et[a, q] * turn_j[q, b]
+                    Ji[k, a, 3 + b] -= Et[a, q] * x[3 * b + q]
+                    Jj[k, a, 3 + b] += Et[a, q] * x[3 * b + q]
+                    Ji[k, a, 12 + b] -= Et[a, q] * skew_B[q, b]
     return r, Ji, Jj, Jc
 
 

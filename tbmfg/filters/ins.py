@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
@@ -74,11 +75,11 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
         if k > 0:
             previous = x.copy()
             _clone(P, clone)
-            t0, t1 = problem.keyframes_s[k - 1], problem.keyframes_s[k]
+            edges = problem.keyframe_edges[k - 1 : k + 1]
+            t0, t1 = problem.keyframes_s[k - 1 : k + 1]
             pieces = max(1, int(np.ceil((t1 - t0) / LONGEST_S - 1e-9)))
-            for piece in range(pieces):
-                a, b = t0 + (t1 - t0) * piece / pieces, t0 + (t1 - t0) * (piece + 1) / pieces
-                x[:21], Phi, Q = propagate(x[:21], a, b, steps.edges_s, inertial.gyro, inertial.acc, *noise)
+            for first, last in pairwise(np.linspace(*edges, pieces + 1).astype(int)):
+                x[:21], Phi, Q = propagate(x[:21], first, last, steps.edges_s, inertial.gyro, inertial.acc, *noise)
                 P[:NAV] = Phi @ P[:NAV]
                 P[:, :NAV] = P[:, :NAV] @ Phi.T
                 P[:NAV, :NAV] += Q

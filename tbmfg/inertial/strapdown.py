@@ -73,10 +73,10 @@ def _mul_skew(A: np.ndarray, v: np.ndarray) -> np.ndarray:
 def mechanise_step(R, p, v, rate, force, dt, earth_n, gravity_n):
     """One step with compensated rate and force (biases removed); returns R, p, v at its end.
 
-    R' = Exp(-w_ie dt) R Exp(rate dt); v' = v + (R f + g - 2 w_ie x v) dt; p' = p + (v + v') dt / 2:
-    tbm_mse (9), (11), (12) with z up.
+    R' = Exp(-w_ie dt) R Exp(rate dt); v' = v + (Exp(-w_ie dt / 2) R f + g - 2 w_ie x v) dt; p' = p + (v + v') dt / 2:
+    tbm_mse (9), (11), (12) with z up. ``force`` is resolved in b at the step's start, n turns on by half a step.
     """
-    a = _apply(R, force)
+    a = _apply(_mul(exp_rotation(-0.5 * dt * earth_n), R), force)
     ax = a[0] + gravity_n[0] - 2.0 * (earth_n[1] * v[2] - earth_n[2] * v[1])
     ay = a[1] + gravity_n[1] - 2.0 * (earth_n[2] * v[0] - earth_n[0] * v[2])
     az = a[2] + gravity_n[2] - 2.0 * (earth_n[0] * v[1] - earth_n[1] * v[0])
@@ -104,24 +104,18 @@ def mechanise(x0, edges, gyro, acc, earth_n, gravity_n):
 
 
 @njit(cache=True)
-def propagate(x0, t0, t1, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_ba, earth_n, gravity_n):
-    """Predict over t0..t1: state (21,), transition Phi (15, 15) and process noise Q (15, 15).
+def propagate(x0, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_ba, earth_n, gravity_n):
+    """Predict from edge ``first`` to edge ``last``: state (21,), transition Phi (15, 15) and process noise Q (15, 15).
 
     ``psd_gyro`` (n,) and ``psd_acc`` (n,) are the white noise of each step [unit^2/Hz], ``psd_bg`` and
-    ``psd_ba`` the bias random walks. Steps are cut at t0 and t1. Errors: d_rot' = -[w]x d_rot - d_bg - n_g,
-    d_v' = -R [f]x d_rot - R d_ba - R n_a, d_p' = d_v; Groves (2013) ch. 14 with a right perturbation.
+    ``psd_ba`` the bias random walks. Errors: d_rot' = -[w]x d_rot - d_bg - n_g, d_v' = -R [f]x d_rot - R d_ba - R n_a,
+    d_p' = d_v; Groves (2013) ch. 14 with a right perturbation.
     """
     R, p, v = x0[:9].copy().reshape(3, 3), x0[9:12].copy(), x0[12:15].copy()
     ba, bg = x0[15:18], x0[18:21]
     Phi, Q = np.eye(15), np.zeros((15, 15))
-    k = max(np.searchsorted(edges, t0, side="right") - 1, 0)
-    t = t0
-    while t < t1 - 1e-9 and k < len(gyro):
-        end = min(edges[k + 1], t1)
-        dt = end - t
-        if dt <= 0.0:
-            k += 1
-            continue
+    for k in range(first, last):
+        dt = edges[k + 1] - edges[k]
         rate, force = gyro[k] - bg, acc[k] - ba
         Rf = _mul_skew(R, force)  # R [f]x
         E = exp_rotation(-rate * dt)
@@ -151,9 +145,6 @@ def propagate(x0, t0, t1, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_ba, e
             Q[9 + i, 9 + i] += psd_ba * dt
             Q[12 + i, 12 + i] += psd_bg * dt
         R, p, v = mechanise_step(R, p, v, rate, force, dt, earth_n, gravity_n)
-        t = end
-        if end >= edges[k + 1] - 1e-12:
-            k += 1
     x1 = x0.copy()
     x1[:9] = R.reshape(9)
     x1[9:12] = p

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.stats import chi2
 
-from tbmfg.inertial.steps import step_index
 from tbmfg.problem import Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother.chain import Block
@@ -30,18 +30,17 @@ class States:
 
 
 def imu_graph(problem: Problem, x: Floats) -> gtsam.NonlinearFactorGraph:
-    """CombinedImuFactor between neighbours, preintegrated at the biases of ``x``; samples are cut at keyframes."""
-    inertial, steps, t = problem.inertial, problem.inertial.steps, problem.keyframes_s
-    base = _parameters(problem, 0.0, 0.0)
+    """CombinedImuFactor between neighbours, preintegrated at the biases of ``x``."""
+    inertial, edges = problem.inertial, problem.keyframe_edges
+    base, steps_dt = _parameters(problem, 0.0, 0.0), problem.inertial.steps.dt
     typical = inertial.psd_gyro.min(), inertial.psd_acc.min()
     graph = gtsam.NonlinearFactorGraph()
-    first, last = step_index(steps, t[:-1] + 1e-9), step_index(steps, t[1:] - 1e-9)
-    for k in range(len(t) - 1):
-        rows = slice(first[k], last[k] + 1)
-        dt = np.diff(np.concatenate([[t[k]], steps.edges_s[first[k] + 1 : last[k] + 1], [t[k + 1]]]))
+    for k, (first, last) in enumerate(pairwise(edges)):
+        rows = slice(first, last)
+        dt = steps_dt[rows]
         # steps that stand in for lost samples: their extra noise, spread over the interval
-        extra_gyro = float(np.sum((inertial.psd_gyro[rows] - typical[0]) * dt) / (t[k + 1] - t[k]))
-        extra_acc = float(np.sum((inertial.psd_acc[rows] - typical[1]) * dt) / (t[k + 1] - t[k]))
+        extra_gyro = float(np.sum((inertial.psd_gyro[rows] - typical[0]) * dt) / dt.sum())
+        extra_acc = float(np.sum((inertial.psd_acc[rows] - typical[1]) * dt) / dt.sum())
         plain = extra_gyro <= 0.0 and extra_acc <= 0.0
         parameters = base if plain else _parameters(problem, extra_gyro, extra_acc)
         pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(x[k, 15:18], x[k, 18:21]))
