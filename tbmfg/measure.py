@@ -113,9 +113,7 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
     ahead = frame.at(middle) @ E[:, 0]
     way, smoothed = (ahead * (speed * steps.dt)[:, None] for speed in (v, smooth))
     sums = [_cumulative(values) for values in (way, smoothed, way * middle[:, None], covered * steps.dt)]
-    way, smoothed, sweep, cover = (
-        np.diff(_interpolate(steps.edges_s, values, keyframes_s), axis=0) for values in sums
-    )
+    way, smoothed, sweep, cover = (np.diff(_interpolate(steps.edges_s, values, keyframes_s), axis=0) for values in sums)
 
     length = np.diff(keyframes_s)
     i = np.flatnonzero(cover > 0.999 * length - 1e-9)

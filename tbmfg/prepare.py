@@ -34,7 +34,8 @@ VALUES = {  # column of the series that each kind of sensor measures with
     "barometer": lambda series: pressure_height(series["pressure"]),
 }
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
-FACTOR_RANGE = (0.3, 1e3)  # what a spectrum may say of a data sheet
+FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
+SCALE_PRIOR_LOG2 = 0.7  # sd of log2 of the noise against the spectrum's floor, for logs that hardly say
 
 
 @dataclass(slots=True)
@@ -409,14 +410,11 @@ def _search(setup: _Setup, offsets: dict[str, float], tell: Callable[[str, float
         if auto:
             scale, sd = _noise_scale(setup, offsets, split, scale)
         tell("prepare", 0.5 + 0.25 * turn)
-    problem = _build(setup, offsets, scale * split)
-    factors = {
-        "noise_factor_gyro": split[0],
-        "noise_factor_acc": split[1],
-        "noise_factor": float(np.sqrt(np.prod(split))),
-    }
-    for key, value in factors.items():
-        problem.calibration[key] = Calibrated(float(scale * value), float(sd * value), auto)
+    factors = np.maximum(scale * split, 1.0) if auto else scale * split
+    problem = _build(setup, offsets, factors)
+    named = {"noise_factor_gyro": factors[0], "noise_factor_acc": factors[1], "noise_factor": np.sqrt(np.prod(factors))}
+    for key, value in named.items():
+        problem.calibration[key] = Calibrated(float(value), float(value * sd / scale), auto)
     return problem
 
 
@@ -455,7 +453,7 @@ def _noise_scale(setup: _Setup, offsets: dict[str, float], split: Floats, start:
     def cost(log2: float) -> float:
         if log2 not in costs:
             problem = _build(setup, offsets, 2.0**log2 * split, SEARCH_S)
-            costs[log2] = ins.run(problem, fixed=("clock_offset",)).cost
+            costs[log2] = ins.run(problem, fixed=("clock_offset",)).cost + (log2 / SCALE_PRIOR_LOG2) ** 2
         return costs[log2]
 
     step, best = 0.5, round(2.0 * np.log2(start)) / 2.0

@@ -101,7 +101,9 @@ def odometer(z, data, xi, xj, c):
         x, y, arm, B = xi[k], xj[k], data[k, :3], data[k, 3:6]
         whole = _unrotate(x, y[9:12] + _rotate(y, arm) - x[9:12])
         bias = x[18:21] - data[k, 6:9]
-        drift = np.array([B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]])
+        drift = np.array(
+            [B[1] * bias[2] - B[2] * bias[1], B[2] * bias[0] - B[0] * bias[2], B[0] * bias[1] - B[1] * bias[0]]
+        )
         way = whole - arm - drift
         turn_i = np.array([[0.0, -whole[2], whole[1]], [whole[2], 0.0, -whole[0]], [-whole[1], whole[0], 0.0]])
         skew_B = np.array([[0.0, -B[2], B[1]], [B[2], 0.0, -B[0]], [-B[1], B[0], 0.0]])
