@@ -52,7 +52,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     free = np.array(
         [k for k in parameters.free if not parameters.names[k].endswith(tuple(fixed) or ("\0",))], dtype=int
     )
-    d, m, n = NAV + e, len(free), len(problem.keyframes_s)
+    d, m, n = NAV + e, len(free), len(problem.keyframe_edges)
     calib, clone = slice(d, d + m), slice(d + m, d + m + 6)
 
     x, c = problem.prior.x.copy(), parameters.start.copy()
@@ -76,14 +76,15 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
             previous = x.copy()
             _clone(P, clone)
             edges = problem.keyframe_edges[k - 1 : k + 1]
-            t0, t1 = problem.keyframes_s[k - 1 : k + 1]
-            pieces = max(1, int(np.ceil((t1 - t0) / LONGEST_S - 1e-9)))
-            for first, last in pairwise(np.linspace(*edges, pieces + 1).astype(int)):
+            elapsed = steps.edges_s[edges[1]] - steps.edges_s[edges[0]]
+            pieces = int(np.ceil(elapsed / LONGEST_S - 1e-9))
+            cuts = edges if pieces <= 1 else np.linspace(*edges, pieces + 1).astype(int)
+            for first, last in pairwise(cuts):
                 x[:21], Phi, Q = propagate(x[:21], first, last, steps.edges_s, inertial.gyro, inertial.acc, *noise)
                 P[:NAV] = Phi @ P[:NAV]
                 P[:, :NAV] = P[:, :NAV] @ Phi.T
                 P[:NAV, :NAV] += Q
-            P[np.arange(NAV, d), np.arange(NAV, d)] += problem.drift_walk**2 * (t1 - t0)
+            P[np.arange(NAV, d), np.arange(NAV, d)] += problem.drift_walk**2 * elapsed
         for rows in problem.rows:
             sensor = rows.sensor
             for r in range(starts[sensor][k], starts[sensor][k + 1]):

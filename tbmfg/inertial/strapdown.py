@@ -169,3 +169,12 @@ def correct_state(x: np.ndarray, d: np.ndarray) -> np.ndarray:
     out[:9] = _mul(x[:9].copy().reshape(3, 3), exp_rotation(d[:3])).reshape(9)
     out[9:] += d[3:]
     return out
+
+
+@njit(cache=True)
+def correct_states(x: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """``correct_state`` for n states: (n, 21 + e), (n, 15 + e)."""
+    out = np.empty_like(x)
+    for k in range(len(x)):
+        out[k] = correct_state(x[k], d[k])
+    return out

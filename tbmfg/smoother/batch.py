@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
-from tbmfg.inertial.strapdown import exp_rotation
+from tbmfg.inertial.strapdown import correct_states
 from tbmfg.problem import GATE, Problem
 from tbmfg.smoother import graph
 from tbmfg.smoother.chain import Block, Elimination, eliminate
@@ -43,7 +43,7 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
     free, n, d = problem.parameters.free, len(x), problem.size
     m = len(free)
     states = States(x.copy(), c.copy())
-    imu = graph.imu_graph(problem, states.x)
+    imu = graph.imu_graph(problem, states.x), graph.no_bias(n)
     blocks, nis, cost = _linearise(problem, imu, states, free)
     damping, converged, iteration = 0.0, False, 0
     while iteration < MAX_ITERATIONS and not converged:
@@ -51,7 +51,7 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
         chain = eliminate(blocks + _damping(blocks, damping, n, d, m), n, d, m)
         _check(problem, chain)
         dx, dc = chain.solve()
-        candidate = States(retract(states.x, dx), states.c.copy())
+        candidate = States(correct_states(states.x, dx), states.c.copy())
         candidate.c[free] += dc
         new_blocks, new_nis, new_cost = _linearise(problem, imu, candidate, free)
         if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
@@ -72,19 +72,10 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
     return Smoothed(states.x, cov, states.c, c_cov, nis, gated, iteration, converged)
 
 
-def retract(x: Floats, dx: Floats) -> Floats:
-    """x (+) dx for all keyframes: (n, 21 + e), (n, 15 + e)."""
-    out = np.empty_like(x)
-    for k, (row, d) in enumerate(zip(x, dx, strict=True)):
-        out[k, :9] = (row[:9].reshape(3, 3) @ exp_rotation(d[:3])).ravel()
-    out[:, 9:] = x[:, 9:] + dx[:, 3:]
-    return out
-
-
 def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block], dict[str, Floats], float]:
     """All whitened rows at ``states``, squared normalised residuals by sensor, and the cost."""
     m, e = len(free), len(problem.drift_walk)
-    blocks = [graph.imu_block(imu, states.x, e, m), *graph.prior_blocks(problem, states, free)]
+    blocks = [graph.imu_block(imu[0], states.x, imu[1], m), *graph.prior_blocks(problem, states, free)]
     if e:
         blocks.append(graph.drift_block(problem, states, m))
     cost = 0.5 * sum(float(np.sum(block.b**2)) for block in blocks)
