@@ -20,14 +20,16 @@ class StreamCounts:
     """What happened to the messages of one topic while they were read.
 
     ``received`` messages were decoded; of these ``duplicate`` repeated a stamp, ``disordered`` came with
-    a stamp before their predecessor's (kept, sorted), ``nonfinite`` held a NaN or infinity.
-    Duplicates and non-finite rows are not in the series. ``undecodable`` never became rows.
+    a stamp before their predecessor's (kept, sorted), ``nonfinite`` held a NaN or infinity, and the stamp of
+    ``misdated`` ones is not to be believed. Duplicates, non-finite and misdated rows are not in the series.
+    ``undecodable`` never became rows.
     """
 
     received: int = 0
     duplicate: int = 0
     disordered: int = 0
     nonfinite: int = 0
+    misdated: int = 0
     undecodable: int = 0
 
 

@@ -217,7 +217,7 @@ def test_a_sound_row_survives_a_broken_one_of_the_same_stamp(tmp_path):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 12), st.booleans()), min_size=1, max_size=30))
+@given(st.lists(st.tuples(st.integers(1, 13), st.booleans()), min_size=1, max_size=30))
 def test_counts_add_up(tmp_path_factory, rows):
     t_ns = np.array([t for t, _ in rows])
     values = np.array([[i, 0, np.nan if broken else 0] for i, (_, broken) in enumerate(rows)], dtype=float)

@@ -249,6 +249,7 @@ def _notes(topic: TopicInfo) -> list[str]:
         found = {
             "repeat a stamp": topic.counts.duplicate,
             "hold a NaN or infinity": topic.counts.nonfinite,
+            "bear a stamp that cannot be right; they are left out": topic.counts.misdated,
             "cannot be decoded": topic.counts.undecodable,
         }
         notes += [f"{count} of {topic.messages} messages {what}" for what, count in found.items() if count]

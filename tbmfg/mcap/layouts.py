@@ -79,7 +79,7 @@ LAYOUTS = {
     ),
     "sensor_msgs/msg/MagneticField": _layout(_HEADER + "field:3f8 _cov:9f8", "field"),
     "sensor_msgs/msg/FluidPressure": _layout(_HEADER + "pressure:f8 variance:f8", "pressure"),
-    "sensor_msgs/msg/NavSatFix": _layout(_HEADER + "status:i1 _service:u2 llh:3f8 cov:9f8 _cov_type:u1", "llh"),
+    "sensor_msgs/msg/NavSatFix": _layout(_HEADER + "status:i1 _service:u2 llh:3f8 cov:9f8 cov_type:u1", "llh"),
     "geometry_msgs/msg/PointStamped": _layout(_HEADER + "point:3f8", "point"),
     "geometry_msgs/msg/TwistStamped": _layout(_HEADER + _TWIST, "linear angular", optional=True),
     "geometry_msgs/msg/TwistWithCovarianceStamped": _layout(

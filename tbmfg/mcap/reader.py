@@ -18,6 +18,7 @@ from tbmfg.mcap import clouds
 from tbmfg.mcap.container import HEAD, Block, McapFile
 from tbmfg.mcap.layouts import LAYOUTS
 from tbmfg.mcap.schemas import full_name
+from tbmfg.mcap.stamps import eras
 from tbmfg.mcap.streams import TRANSFORMS, CloudStream, Entries, SeriesStream, Stream, TransformStream
 from tbmfg.timeseries import Log
 
@@ -39,10 +40,11 @@ class Recording:
     def log(self) -> Log:
         streams = self.streams.values()
         undecoded = [s for s in streams if isinstance(s, TransformStream) and s.undecodable]
+        starts = eras(s.stamps()[0] for s in streams)
         return Log(
             self.path,
-            {s.topic: s.series() for s in streams if isinstance(s, SeriesStream)},
-            {s.topic: s.clouds() for s in streams if isinstance(s, CloudStream)},
+            {s.topic: s.series(starts) for s in streams if isinstance(s, SeriesStream)},
+            {s.topic: s.clouds(starts) for s in streams if isinstance(s, CloudStream)},
             tuple(t for s in streams if isinstance(s, TransformStream) for t in s.transforms()),
             self.attachments,
             self.unknown,

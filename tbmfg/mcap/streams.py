@@ -14,6 +14,7 @@ from tbmfg.mcap.clouds import McapClouds, Place, decode_cloud
 from tbmfg.mcap.container import Block
 from tbmfg.mcap.layouts import Layout, Rows, decode
 from tbmfg.mcap.schemas import definition
+from tbmfg.mcap.stamps import misdated
 from tbmfg.timeseries import Floats, Series, StreamCounts, Times, Transform
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -84,15 +85,16 @@ class SeriesStream(Stream):
         rows = self._rows()
         return rows.t_ns, self.log_ns()[rows.good]
 
-    def series(self) -> Series:
-        """Sorted by stamp, without duplicates and rows that are not finite."""
+    def series(self, eras: Times) -> Series:
+        """Sorted by stamp, without duplicates, rows that are not finite and stamps of other ``eras``."""
         rows = self._rows()
         columns = _filled(self._layout, rows.columns)
         finite = np.ones(len(rows.t_ns), dtype=bool)
         for name in self._layout.checked:
             if name in columns:
                 finite &= _finite_rows(columns[name])
-        kept, counts = _in_time_order(rows.t_ns, finite, int((~rows.good).sum()))
+        wrong = misdated(*self.stamps(), eras)
+        kept, counts = _in_time_order(rows.t_ns, finite, wrong, int((~rows.good).sum()))
         return Series(
             self.topic,
             self.type,
@@ -130,9 +132,10 @@ class CloudStream(Stream):
     def stamps(self) -> tuple[Times, Times]:
         return np.array(self._t_ns, dtype=np.int64), self.log_ns()[np.array(self._good, dtype=bool)]
 
-    def clouds(self) -> McapClouds:
-        t_ns, _ = self.stamps()
-        kept, counts = _in_time_order(t_ns, np.ones(len(t_ns), dtype=bool), self._good.count(False))
+    def clouds(self, eras: Times) -> McapClouds:
+        t_ns, log_ns = self.stamps()
+        wrong = misdated(t_ns, log_ns, eras)
+        kept, counts = _in_time_order(t_ns, np.ones(len(t_ns), dtype=bool), wrong, self._good.count(False))
         return McapClouds(self.topic, t_ns[kept], tuple(self._places[i] for i in kept), self._frame_id, counts)
 
 
@@ -163,9 +166,11 @@ class TransformStream(Stream):
         return tuple(self._transforms.values())
 
 
-def _in_time_order(t_ns: Times, usable: NDArray[np.bool_], undecodable: int) -> tuple[NDArray[np.intp], StreamCounts]:
+def _in_time_order(
+    t_ns: Times, finite: NDArray[np.bool_], wrong: NDArray[np.bool_], undecodable: int
+) -> tuple[NDArray[np.intp], StreamCounts]:
     """Rows to keep, by stamp, the first of each stamp; and what happened to the others."""
-    index = np.flatnonzero(usable)
+    index = np.flatnonzero(finite & ~wrong)
     index = index[np.argsort(t_ns[index], kind="stable")]
     first = np.ones(len(index), dtype=bool)
     first[1:] = np.diff(t_ns[index]) > 0
@@ -173,7 +178,8 @@ def _in_time_order(t_ns: Times, usable: NDArray[np.bool_], undecodable: int) -> 
         received=len(t_ns),
         duplicate=int((~first).sum()),
         disordered=int((np.diff(t_ns) < 0).sum()),
-        nonfinite=int((~usable).sum()),
+        nonfinite=int((~finite).sum()),
+        misdated=int((finite & wrong).sum()),
         undecodable=undecodable,
     )
     return index[first], counts
