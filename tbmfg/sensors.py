@@ -76,6 +76,7 @@ def prism(z, data, xi, xj, c):
             Jc[k, a, 3] = -velocity[a]
             for b in range(3):
                 Jc[k, a, b] = x[3 * a + b]
+        _add_minus_R_skew(Jc[k, :, 0:3], x, w, -lag)
     return r, Ji, np.zeros((n, 3, 0)), Jc
 
 
