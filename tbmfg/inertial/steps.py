@@ -10,6 +10,7 @@ from tbmfg.errors import LogError
 from tbmfg.timeseries import Floats, Series, Times, seconds
 
 GAP = 1.5  # periods between stamps from which a sample counts as lost
+MOST_LOST = 50  # lost samples for each one at hand from which the stamps are at fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,12 @@ def make_steps(imu: Series, R_bi: Floats, stamp: str) -> Steps:
         none = np.zeros(len(t))
         return Steps(t0_ns, edges, gyro, acc, none, none.copy(), period, ())
 
+    missing = float(np.sum(spacing[lost])) / period
+    if missing > MOST_LOST * len(imu):
+        raise LogError(
+            f"{imu.topic}: {len(imu)} samples a median {period:.3g} s apart, but for {t[-1]:.3g} s; stamps that come "
+            "in bursts are times of arrival: record those of the measurement, or cut the log at its longest pause"
+        )
     fill_t, gaps = [], []
     for k in lost:
         count = max(1, round(spacing[k] / period) - 1)
@@ -86,7 +93,7 @@ def make_steps(imu: Series, R_bi: Floats, stamp: str) -> Steps:
 
 
 def interpolation_error(known: Floats, count: int) -> float:
-    """RMS error per axis of replacing the mean of ``count`` samples by their two neighbours' mean; units of ``known``."""
+    """RMS error per axis of replacing the mean of ``count`` samples by their two neighbours' mean."""
     count = min(count, max(1, len(known) // 3))
     total = np.concatenate([np.zeros((1, 3)), np.cumsum(known, axis=0)])
     starts = np.arange(1, len(known) - count)
