@@ -26,7 +26,7 @@ app = typer.Typer(
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="An .mcap file or a rosbag2 folder.", show_default=False)]
 RigName = Annotated[
-    str | None, typer.Option("--rig", metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's own.")
+    str | None, typer.Option("--rig", metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess.")
 ]
 Truth = Annotated[
     str, typer.Option(metavar="auto|none|TOPIC|FILE", help="Reference to compare with; auto: the rig's, or by name.")
@@ -73,6 +73,22 @@ def info(log: LogPath, debug: Debug = False) -> None:
         from tbmfg.mcap import info_text
 
         typer.echo(info_text(log))
+
+
+@app.command()
+def init(
+    log: LogPath,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Write a starter rig for a log: what it shows, and what had to be guessed."""
+    with _errors_in_one_line(debug):
+        from tbmfg import pipeline
+
+        for line in pipeline.init(log, output, force=force):
+            typer.echo(line)
+        typer.echo(f"rig: {output}")
 
 
 @app.command()

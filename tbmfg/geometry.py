@@ -53,6 +53,14 @@ def rotation_from_rpy(rpy: Floats) -> Floats:
     return Rotation.from_euler("ZYX", np.asarray(rpy, dtype=float)[::-1]).as_matrix()
 
 
+def rpy_from_rotation(R: Floats) -> Floats:
+    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll); (3, 3) -> (3,). Roll is 0 at 90 deg pitch."""
+    R = np.asarray(R, dtype=float)
+    if abs(R[2, 0]) > 1 - 1e-12:
+        return np.array([0.0, -np.sign(R[2, 0]) * np.pi / 2, np.arctan2(-R[0, 1], R[1, 1])])
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(R[2, 0]), np.arctan2(R[1, 0], R[0, 0])])
+
+
 def yaw_of(R_nb: Floats) -> Floats:
     """Heading of the body's x axis, counter-clockwise from n's x axis, rad; (..., 3, 3) -> (...)."""
     return np.arctan2(R_nb[..., 1, 0], R_nb[..., 0, 0])

@@ -8,7 +8,7 @@ import numpy as np
 
 from tbmfg.earth import north_direction
 from tbmfg.geometry import exp_so3, rotation_from_rpy
-from tbmfg.inertial.steps import Steps, step_index
+from tbmfg.inertial.steps import GAP, Steps, step_index
 from tbmfg.rig import Barometer, Keyframes, Magnetometer, Odometer, PositionSensor
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
@@ -99,9 +99,12 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
 
     Intervals that the samples do not cover are left out.
     """
-    period = float(np.median(np.diff(speeds.t_s)))
+    spacing = np.diff(speeds.t_s)
+    period = float(np.median(spacing))
     ends = speeds.t_s - sensor.clock_offset
-    starts = np.maximum(ends - period, np.concatenate([[-np.inf], ends[:-1]]))
+    # stamps jitter: a sample covers the time since the one before, unless one was lost between them
+    alone = np.append(True, spacing > GAP * period)
+    starts = ends - np.where(alone, period, np.append(period, spacing))
     steps = frame.steps
     middle = 0.5 * (steps.edges_s[:-1] + steps.edges_s[1:])
     k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)

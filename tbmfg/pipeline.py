@@ -11,7 +11,15 @@ from typing import Any
 
 from tbmfg import __version__
 from tbmfg.errors import RigError, TbmfgError
-from tbmfg.results import find_truth, load_truth, refuse_existing, summarise, write_result
+from tbmfg.results import (
+    find_truth,
+    load_truth,
+    refuse_existing,
+    refuse_existing_file,
+    summarise,
+    write_result,
+    write_text,
+)
 from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
 from tbmfg.timeseries import NS, Log
 
@@ -37,11 +45,11 @@ def run(
 ) -> dict[str, Any]:
     """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files.
 
-    ``rig``: a Rig, a shipped name or a file; None takes the one attached to the log. ``outages``: (sensor,
-    start, end) in seconds from the first IMU sample, stamps as recorded. ``without`` drops sensors, ``only``
-    keeps just these and the IMU. ``overrides``: ``key.path=value`` over the rig. ``progress`` is called
-    with the stage and the done fraction of it. ``wall_s`` is the time from opening the log to the result: without
-    evaluating, writing and the imports that can be done before.
+    ``rig``: a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
+    ``outages``: (sensor, start, end) in seconds from the first IMU sample, stamps as recorded. ``without`` drops
+    sensors, ``only`` keeps just these and the IMU. ``overrides``: ``key.path=value`` over the rig. ``progress`` is
+    called with the stage and the done fraction of it. ``wall_s`` is the time from opening the log to the result:
+    without evaluating, writing and the imports that can be done before.
     """
     from tbmfg.estimators import ESTIMATORS, estimate
     from tbmfg.evaluation.metrics import evaluate
@@ -55,14 +63,14 @@ def run(
 
     started = time.perf_counter()
     log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
-    rig = rig_for(log, rig, overrides)
+    rig, assumed = rig_for(log, rig, overrides)
     without = dropped_sensors(rig, without, only)
     reference = find_truth(truth, log, rig)
     prepared = prepare(log, rig, outages=tuple(outages), without=without, progress=progress)
     result = estimate(estimator, prepared, progress=progress)
     wall_s = time.perf_counter() - started
 
-    result.warnings = list(dict.fromkeys([*prepared.warnings, *result.warnings]))
+    result.warnings = list(dict.fromkeys([*assumed, *prepared.warnings, *result.warnings]))
     span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
     summary: dict[str, Any] = {
         "tbmfg_version": __version__,
@@ -91,19 +99,37 @@ def run(
     return summary
 
 
-def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> Rig:
-    """The rig given, else the one attached to the log, with ``overrides`` applied."""
-    if rig is None:
-        if ATTACHED_RIG not in log.attachments:
-            raise RigError(f"{log.path}: has no rig attached; name one with --rig NAME or --rig FILE")
+def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> tuple[Rig, list[str]]:
+    """The rig given, else the one attached to the log, else one inferred from it, with ``overrides`` applied; and
+    what was assumed for an inferred one."""
+    assumed: list[str] = []
+    if rig is None and ATTACHED_RIG in log.attachments:
         source = f"{log.path}: attachment {ATTACHED_RIG}"
         try:
             rig = parse_rig(log.attachments[ATTACHED_RIG].decode("utf-8"), source)
         except UnicodeDecodeError as error:
             raise RigError(f"{source}: cannot be read: not UTF-8 text") from error
+    elif rig is None:
+        from tbmfg.inference import infer
+
+        inferred = infer(log)
+        rig, assumed = inferred.rig, inferred.lines()
     elif not isinstance(rig, Rig):
         rig = load_rig(rig)
-    return override(rig, overrides) if overrides else rig
+    return override(rig, overrides) if overrides else rig, assumed
+
+
+def init(log_path: str | Path, output: str | Path, *, force: bool = False) -> list[str]:
+    """Write a starter rig for a log to the file ``output`` and return what was assumed in it, line by line."""
+    from tbmfg.inference import infer, starter
+    from tbmfg.mcap import read_log
+
+    output = Path(output)
+    refuse_existing_file(output, force)
+    log = read_log(log_path)
+    inferred = infer(log)
+    write_text(output, starter(inferred, log.path), force=force)
+    return [*log.damage, *inferred.lines()]
 
 
 def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -> tuple[str, ...]:

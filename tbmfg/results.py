@@ -41,6 +41,24 @@ def refuse_existing(output: str | Path, force: bool) -> None:
         raise TbmfgError(f"{output}: already holds {', '.join(existing)}; give another folder, or --force to replace")
 
 
+def write_text(path: str | Path, text: str, *, force: bool = False) -> None:
+    """Write one text file, which appears under its name only when complete; raises where it exists without ``force``."""
+    from tbmfg.mcap.writer import replacing
+
+    refuse_existing_file(path, force)
+    with replacing(Path(path)) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
+def refuse_existing_file(path: str | Path, force: bool) -> None:
+    """Raise unless the file ``path`` may be written."""
+    path = Path(path)
+    if path.is_dir():
+        raise TbmfgError(f"{path}: is a folder; -o wants a file here")
+    if path.exists() and not force:
+        raise TbmfgError(f"{path}: exists already; give another name, or --force to replace it")
+
+
 def write_result(
     output: str | Path, result: Result, summary: dict[str, Any], rig_yaml: str, *, force: bool = False
 ) -> None:

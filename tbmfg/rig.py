@@ -147,6 +147,8 @@ class Imu(Sensor):
     stamp: Literal["start", "centre", "end"] = Field(
         "end", description="Where in its sampling period a sample is stamped; most drivers stamp on arrival."
     )
+    gyro_unit: Literal["rad/s", "deg/s"] = Field("rad/s", description="Unit of the messages; ROS has rad/s.")
+    acc_unit: Literal["m/s^2", "g"] = Field("m/s^2", description="Unit of the messages; ROS has m/s^2.")
     T_bi: Mounting = Field(Mounting(), description="Turns IMU axes into b.")
     gyro_density_dps_rthz: Positive = Field(0.01, description="White noise, deg/s/sqrt(Hz).")
     acc_density_ug_rthz: Positive = Field(200.0, description="White noise, micro-g/sqrt(Hz).")
@@ -162,6 +164,16 @@ class Imu(Sensor):
     acc_density = si("acc_density_ug_rthz", MICRO_G)
     gyro_bias_sd = si("gyro_bias_sd_dps", DEG)
     acc_bias_sd = si("acc_bias_sd_mps2")
+
+    @property
+    def gyro_scale(self) -> float:
+        """What turns the messages' angular rates into rad/s."""
+        return DEG if self.gyro_unit == "deg/s" else 1.0
+
+    @property
+    def acc_scale(self) -> float:
+        """What turns the messages' specific forces into m/s^2."""
+        return STANDARD_GRAVITY if self.acc_unit == "g" else 1.0
 
 
 class PositionSensor(Sensor):

@@ -49,6 +49,12 @@ def dump(data: Any) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
 
 
+def inline(data: dict[str, Any]) -> str:
+    """A mapping as one line without its outer braces."""
+    flow = {"default_flow_style": True, "width": math.inf, "sort_keys": False}
+    return yaml.dump(data, Dumper=_Dumper, allow_unicode=True, **flow).strip()[1:-1]
+
+
 def parse(text: str, source: str) -> tuple[Any, dict[KeyPath, int]]:
     """The data in ``text`` and the line of every key path, from 1; ``source`` names it in messages."""
     tree = _Tree(source)

@@ -190,9 +190,9 @@ def test_faults_of_the_input_take_one_line(toy, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_log_without_rig_says_how_to_give_one(toy, tmp_path):
+def test_a_log_without_rig_and_imu_is_refused(toy, tmp_path):
     toy.logs["bare.mcap"] = Log("bare.mcap", {})
-    assert "--rig NAME or --rig FILE" in fault("run", "bare.mcap", "-o", str(tmp_path / "out"))
+    assert "bare.mcap: no sensor_msgs/Imu to estimate from" in fault("run", "bare.mcap", "-o", str(tmp_path / "out"))
 
 
 def test_existing_results_are_refused_before_any_work(toy, tmp_path):

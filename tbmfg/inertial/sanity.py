@@ -1,0 +1,65 @@
+"""What an IMU's own samples say against its units and its health, before anything is integrated."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tbmfg.inertial.steps import Steps
+from tbmfg.inertial.strapdown import rotations
+from tbmfg.timeseries import Floats
+
+IN_G = (0.8, 1.2)  # typical specific force on Earth that was never multiplied by gravity
+ON_EARTH = (5.0, 30.0)  # m/s^2: with vibration; below it gravity is missing, above it the unit is another
+WINDOW_S, EDGE_S = 10.0, 1.0  # gravity is followed over this time, and is a mean over that at either end
+ASTRAY = np.deg2rad(30.0)  # gravity is not where the gyro says
+BETTER = 3.0  # times smaller must the angle be in another unit
+
+
+def fault(steps: Steps) -> str | None:
+    """Why these samples cannot be SI values of a working IMU on Earth, and what to do; None if they can."""
+    for what, values in (("gyro", steps.gyro), ("accelerometer", steps.acc)):
+        if not np.ptp(values, axis=0).any():
+            same = " ".join(f"{x:.4g}" for x in values[0])
+            return f"all samples of the {what} read {same}: it is stuck; check the sensor and its driver"
+    typical = float(np.median(np.linalg.norm(steps.acc, axis=1)))
+    if IN_G[0] < typical < IN_G[1]:
+        return (
+            f"specific force is typically {typical:.3g} m/s^2 where gravity alone is 9.8: it seems to be in g; if so, "
+            "set sensors.imu.acc_unit=g"
+        )
+    if not ON_EARTH[0] < typical < ON_EARTH[1]:
+        reason = "gravity seems to be removed" if typical < IN_G[0] else "the unit is not m/s^2"
+        return (
+            f"specific force is typically {typical:.3g} m/s^2 where gravity alone is 9.8: {reason}; record what the "
+            "accelerometer measures, or set sensors.imu.acc_unit (m/s^2 or g)"
+        )
+    astray, along = gravity_astray(steps, 1.0), gravity_astray(steps, np.pi / 180)
+    if astray > ASTRAY and BETTER * along < astray:
+        return (
+            f"the gyro turns gravity {np.rad2deg(astray):.0f} deg away from where the accelerometer sees it, and only "
+            f"{np.rad2deg(along):.0f} deg if it is in deg/s; if so, set sensors.imu.gyro_unit=deg/s"
+        )
+    return None
+
+
+def gravity_astray(steps: Steps, scale: float) -> float:
+    """Angle [rad] between the gravity that the gyro, times ``scale``, carries through ten seconds and the one that
+    the accelerometer then sees; median over the log. The gyro's median passes for its bias. 0 where the gyro cannot
+    have turned far or the log is short."""
+    size, edge = round(WINDOW_S / steps.period_s), max(1, round(EDGE_S / steps.period_s))
+    turned = np.median(np.linalg.norm(steps.gyro, axis=1)) * WINDOW_S
+    if len(steps) <= size + edge or turned < ASTRAY:
+        return 0.0
+    R_0t = rotations(steps.edges_s, scale * steps.gyro, scale * np.median(steps.gyro, axis=0))
+    before = np.arange(0, len(steps) - size - edge, size)
+    up_before, up_after = _means(steps.acc, before, edge), _means(steps.acc, before + size, edge)
+    middle = before + edge // 2
+    carried = np.einsum("nji,njk,nk->ni", R_0t[middle + size], R_0t[middle], up_before)
+    cosine = np.sum(carried * up_after, axis=1) / np.linalg.norm(carried, axis=1) / np.linalg.norm(up_after, axis=1)
+    return float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _means(values: Floats, starts: np.ndarray, count: int) -> Floats:
+    """Means of ``count`` rows from each start."""
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(values, axis=0)])
+    return (total[starts + count] - total[starts]) / count
