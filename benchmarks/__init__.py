@@ -17,5 +17,5 @@ from __future__ import annotations
 
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
-
+    "speed": "benchmarks.speed",
 }

@@ -1,0 +1,209 @@
+"""Benchmarks: the statistics on draws whose answer is known, the commands on tiny runs, and the gate both ways."""
+
+import json
+from argparse import Namespace
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import datasets
+from benchmarks import accuracy, gate, runs, speed
+from benchmarks.__main__ import main
+from benchmarks.gate import Tolerance, compare
+from benchmarks.rows import Row, print_tables, read_rows, to_text
+from tbmfg.rig import dump_rig, override
+
+KEYS = ["scenario", "estimator", "metric", "unit", "mean", "sd", "n", "bound", "published"]
+
+
+def drawn(rng, count, spread=1.0, estimator="toy"):
+    """Runs of an estimator whose errors are ``spread`` times what its covariance says; three epochs."""
+    out = []
+    for seed in range(count):
+        normalised = spread * rng.standard_normal((3, 6))
+        nees = np.sum(normalised**2, axis=1)
+        parts = {"position": np.sum(normalised[:, 3:] ** 2, axis=1)}
+        z = {"scale": spread * rng.standard_normal()}
+        metrics = {("position", "mm"): 2.0 + seed % 2}
+        epochs_s = np.array([10.0, 20.0, 30.0])
+        out.append(
+            runs.Measured("draws", estimator, seed, metrics, {"position": 5.0}, epochs_s, nees, parts, normalised, z)
+        )
+    return out
+
+
+def by_metric(rows):
+    return {row.metric: row for row in rows}
+
+
+# ---- statistics ----
+
+
+def test_consistent_draws_pass_and_their_shares_are_gaussian():
+    rows = by_metric(accuracy.summarise(drawn(np.random.default_rng(1), 400), alpha=0.01 / 3))
+    for time_s in (10, 20, 30):
+        cell = rows[f"nees_pose@{time_s}s"]
+        assert cell.bound == pytest.approx(tuple(chi2.ppf([0.005 / 3, 1 - 0.005 / 3], 2400) / 2400))
+        assert cell.inside
+        assert cell.n == 400
+    # share of 7200 draws: sd below 0.6 %
+    for k, share in ((1, 68.27), (2, 95.45), (3, 99.73)):
+        assert rows[f"within_{k}sd"].mean == pytest.approx(share, abs=1.8)
+    assert rows["nees_position"].mean == pytest.approx(1.0, abs=0.07)
+    assert rows["z_scale"].mean == pytest.approx(0.0, abs=0.15)
+    assert rows["z_scale"].sd == pytest.approx(1.0, abs=0.11)
+    assert rows["position"].mean == pytest.approx(2.5)
+    assert rows["position"].bound == (None, 5.0)
+    assert rows["failed"].mean == 0
+
+
+@pytest.mark.parametrize("spread", [0.7, 1.4])
+def test_covariances_wrong_by_40_percent_are_found_in_30_runs(spread):
+    rows = accuracy.summarise(drawn(np.random.default_rng(2), 30, spread), alpha=0.01 / 24)
+    assert not any(row.inside for row in rows if row.metric.startswith("nees_pose"))
+
+
+def test_false_alarms_of_a_whole_command_are_one_percent():
+    from tbmfg.evaluation.metrics import chi_square_bounds
+
+    commands, cells = 4000, 24
+    low, high = chi_square_bounds(30, 6, accuracy.CHANCE / cells)
+    means = np.random.default_rng(3).chisquare(6 * 30, (commands, cells)) / 30
+    alarms = np.mean(np.any((means < low) | (means > high), axis=1))
+    assert alarms == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / commands))
+
+
+def test_epochs_end_with_the_log_and_are_the_nearest_keyframes():
+    stamps = np.array([0, 9, 11, 19, 22, 30]) * 10**9
+    assert runs.epochs(stamps, 30.0, 3).tolist() == [1, 3, 5]
+
+
+def test_failed_seeds_are_counted_and_left_out():
+    good = drawn(np.random.default_rng(4), 3)
+    rows = by_metric(accuracy.summarise([*good, replace(good[0], seed=9, failure="no prism")], 0.01))
+    assert (rows["failed"].mean, rows["failed"].n, rows["failed"].inside) == (1, 4, False)
+    assert rows["position"].n == 3
+
+
+def test_biases_are_those_of_the_sample_that_ends_at_the_keyframe():
+    simulation = datasets.make("tbm-drive", seed=1, duration=2.0)
+    stamps = simulation.clean["imu"].t_ns
+    bias_acc, bias_gyro = runs.true_biases(simulation, stamps[[3, 700]] + 1000)
+    np.testing.assert_array_equal(bias_acc, simulation.drawn["imu"]["bias_acc"][[3, 700]])
+    np.testing.assert_array_equal(bias_gyro, simulation.drawn["imu"]["bias_gyro"][[3, 700]])
+
+
+# ---- rows ----
+
+
+def test_rows_return_from_json_and_print_plainly(capsys, tmp_path):
+    rows = [
+        Row("s", "batch", "position", "mm", 4.0, 1.0, 3, (None, 5.0)),
+        Row("s", "ins", "position", "mm", 6.0, 1.0, 3, (None, 5.0)),
+        Row("s", "ins", "yaw", "deg", None, None, 3, None, 0.2),
+    ]
+    (tmp_path / "rows.json").write_text(to_text(rows))
+    assert read_rows(tmp_path / "rows.json") == rows
+    assert list(json.loads(to_text(rows))[0]) == KEYS
+    print_tables(rows)
+    out = capsys.readouterr().out.splitlines()
+    assert out[1].split() == ["metric", "unit", "batch", "ins", "n", "bound", "published"]
+    assert "4 ± 1" in out[2]
+    assert "6 ± 1 !" in out[2]
+    assert out[-1] == "1 of 2 means lie in their bounds"
+    assert not any("\x1b" in line for line in out)
+
+
+# ---- gate ----
+
+
+def test_tolerance():
+    assert Tolerance(0.1).holds(1.09, 1.0)
+    assert not Tolerance(0.1).holds(0.89, 1.0)
+    assert Tolerance(0.1, one_sided=True).holds(0.2, 1.0)
+    assert not Tolerance(0.1, 0.05, one_sided=True).holds(1.16, 1.0)
+
+
+def test_compare_names_what_is_worse_and_what_is_gone():
+    old = [Row("s", "batch", m, u, 1.0, 0.1, 6) for m, u in (("position", "mm"), ("nees_pose@10s", ""), ("ape", "mm"))]
+    new = [replace(old[0], mean=1.2), replace(old[1], mean=0.95)]
+    faults = compare(new, old, accuracy.tolerance)
+    assert len(faults) == 2
+    assert faults[0].startswith("s batch position: 1.2 against 1 mm")
+    assert faults[1].startswith("s batch ape: missing")
+
+
+# ---- commands ----
+
+
+@pytest.mark.slow
+def test_accuracy_runs_and_becomes_a_baseline_that_it_then_holds(capsys, monkeypatch, tmp_path):
+    tiny = {"scenario": ["tbm-drive"], "seeds": 2, "duration": 6.0, "epochs": 2}
+    for key, value in tiny.items():
+        monkeypatch.setitem(accuracy.GATE, key, value)
+    baseline, out = tmp_path / "baseline.json", tmp_path / "rows.json"
+    files = ["--baseline", str(baseline), "--json", str(out)]
+    assert main(["accuracy", "--update-baseline", *files]) == 0
+    rows = read_rows(out)
+    assert {row.estimator for row in rows} == {"batch", "ins"}
+    metrics = {row.metric for row in rows}
+    assert {"position", "ape", "prism_point", "yaw", "tilt", "velocity", "nees_pose@3s", "nees_pose@6s"} <= metrics
+    assert {"within_1sd", "z_prism_arm_x", "z_odometer_scale", "z_bias_gyro_z", "nis_prism"} <= metrics
+    assert all(row.n == 2 and row.mean is not None for row in rows)
+    assert json.loads(baseline.read_text())["accuracy"]["options"]["seeds"] == 2
+
+    asked = []
+    monkeypatch.setattr(accuracy, "measure", lambda given: asked.append(given) or rows)
+    assert main(["accuracy", "--gate", *files]) == 0
+    assert (asked[0].seeds, asked[0].duration, asked[0].scenario) == (2, 6.0, ["tbm-drive"])
+    worse = [replace(row, mean=1.2 * row.mean) if row.metric == "prism_point" else row for row in rows]
+    monkeypatch.setattr(accuracy, "measure", lambda given: worse)
+    assert main(["accuracy", "--gate", *files]) == 1
+    assert "prism_point" in capsys.readouterr().out
+
+
+def test_gate_without_a_baseline_says_how_to_make_one(capsys, tmp_path):
+    assert main(["accuracy", "--gate", "--baseline", str(tmp_path / "none.json")]) == 1
+    assert "--update-baseline" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("wrong", [["--estimators", "oracle"], ["--scenario", "moon"], ["--seeds", "0"]])
+def test_wrong_options_are_told_in_one_line(capsys, wrong):
+    assert main(["accuracy", *wrong]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_committed_baseline_fits_the_gate():
+    held, rows = gate.load(gate.BASELINE, "accuracy")
+    assert held == accuracy.GATE
+    assert all(accuracy.tolerance(row) for row in rows)
+
+
+def test_speed_without_a_recording_is_skipped(capsys, monkeypatch):
+    monkeypatch.delenv("TBMFG_DATA", raising=False)
+    assert main(["speed"]) == 0
+    assert "TBMFG_DATA" in capsys.readouterr().out
+
+
+def test_script_and_smoother_solve_the_same_problem(tmp_path):
+    """With prism and IMU only, on a machine that does not shake, the yardstick measures the same work.
+
+    The gyro is a worse one than the machine's own, whose bias walk is too small for the Cholesky of ``Marginals``.
+    """
+    worse = ("sensors.imu.gyro_walk=1e-5", "sensors.imu.acc_walk=1e-3", "sensors.imu.noise_factor=10.0")
+    simulation = datasets.make("tbm-drive", seed=3, duration=12.0, vibration=0.0, settings=worse)
+    log, rig = tmp_path / "drive.mcap", tmp_path / "rig.yaml"
+    simulation.write(log)
+    sensors = {name: simulation.rig.sensors[name] for name in ("imu", "prism")}
+    machine = simulation.rig.model_copy(update={"sensors": sensors})
+    rig.write_text(dump_rig(override(machine, ["zero_velocity.enabled=false"])))
+    rows = speed.measure(Namespace(log=log, rig=str(rig), assignments=[], repeat=1))
+    found = {(row.estimator, row.metric): row for row in rows}
+    assert found["tbmfg", "position_difference"].mean < 0.05
+    assert found["tbmfg", "position_sd_ratio"].mean == pytest.approx(1.0, abs=0.01)
+    stages = [found["tbmfg", stage].mean for stage in speed.SHOWN]
+    assert min(stages) > 0
+    assert sum(stages[:-1]) <= stages[-1]
+    assert found["tbmfg", "total / bare"].bound == (None, speed.LIMIT)
