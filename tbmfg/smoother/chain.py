@@ -15,6 +15,8 @@ from numba import njit
 
 from tbmfg.timeseries import Floats
 
+RANK = 1e-12  # of a column's length: what is left of it below this is rounding, and the unknown not determined
+
 
 @dataclass(frozen=True, slots=True)
 class Block:
@@ -48,7 +50,7 @@ def assemble(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, np.nd
 
 @njit(cache=True)
 def _triangularise(W: np.ndarray, rows: int, columns: int) -> None:
-    """Householder QR of W[:rows, :columns] in place; reflections act on all columns, the sign of R's diagonal is free."""
+    """Householder QR of W[:rows, :columns] in place; it turns all columns, and the sign of R's diagonal is free."""
     width = W.shape[1]
     w = np.empty(width)
     for j in range(min(columns, rows)):
@@ -163,7 +165,7 @@ def _covariances(conditionals, border, n, d, m):
     for k in range(n - 1, -1, -1):
         row = conditionals[k]
         inverse = _upper_solve(row[:, :d], np.eye(d))
-        G = inverse @ row[:, d : 2 * d + m]
+        G = inverse @ row[:, d : 2 * d + m].copy()
         GJ = G @ J
         cov = inverse @ inverse.T + GJ @ G.T
         out[k] = 0.5 * (cov + cov.T)
@@ -175,10 +177,13 @@ def _covariances(conditionals, border, n, d, m):
 
 @dataclass(frozen=True, slots=True)
 class Elimination:
-    """An eliminated chain: solves, and gives covariances."""
+    """An eliminated chain: solves, and gives covariances. ``scale`` (n, d) and ``border_scale`` (m,) are the lengths of
+    the columns that went in."""
 
     conditionals: Floats
     border: Floats
+    scale: Floats
+    border_scale: Floats
     n: int
     d: int
     m: int
@@ -193,14 +198,26 @@ class Elimination:
 
     def undetermined(self) -> list[tuple[int, int]]:
         """Unknowns that no row determines: (keyframe, index), keyframe -1 for a constant."""
-        diagonal = np.einsum("kii->ki", self.conditionals[:, :, : self.d])
-        found = [(int(k), int(i)) for k, i in np.argwhere(~(np.abs(diagonal) > 1e-12))]
-        border = np.diagonal(self.border[:, : self.m])
-        return found + [(-1, int(i)) for i in np.flatnonzero(~(np.abs(border) > 1e-12))]
+        # QR leaves rounding of the column's length in the place of a zero: some 1e-13 of it after 30 000 keyframes
+        known = np.abs(np.einsum("kii->ki", self.conditionals[:, :, : self.d])) > RANK * self.scale
+        found = [(int(k), int(i)) for k, i in np.argwhere(~known)]
+        border = np.abs(np.diagonal(self.border[:, : self.m])) > RANK * self.border_scale
+        return found + [(-1, int(i)) for i in np.flatnonzero(~border)]
 
 
 def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
     """Eliminate n keyframes of dimension d with a border of m constants; blocks in any order."""
     U, u_start, B, b_start = assemble(blocks, n, d, m)
     conditionals, border = _eliminate(U, u_start, B, b_start, n, d, m)
-    return Elimination(conditionals, border, n, d, m)
+    return Elimination(conditionals, border, *_lengths(blocks, n, d, m), n, d, m)
+
+
+def _lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:
+    """Length of every column, keyframes (n, d) and constants (m,)."""
+    squares, border = np.zeros((n, d)), np.zeros(m)
+    for block in blocks:
+        np.add.at(squares, block.i, np.sum(block.A_i**2, axis=1))
+        if block.A_j is not None:
+            np.add.at(squares, block.i + 1, np.sum(block.A_j**2, axis=1))
+        border += np.sum(block.A_c**2, axis=(0, 1))
+    return np.sqrt(squares), np.sqrt(border)
