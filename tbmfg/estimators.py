@@ -10,7 +10,9 @@ from tbmfg.errors import TbmfgError
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
+    from tbmfg.smoother.incremental import Online
     from tbmfg.state import Result
+    from tbmfg.timeseries import Floats
 
 
 Progress = Callable[[float], None]
@@ -44,14 +46,44 @@ def ins(problem: Problem, progress: Progress) -> Result:
 def batch(problem: Problem, progress: Progress) -> Result:
     """Smoother over the whole log, started from ``ins``."""
     from tbmfg.filters import ins as filter_
-    from tbmfg.outcome import result
+    from tbmfg.outcome import beyond_gate, result
     from tbmfg.smoother import batch as smoother
 
     f = filter_.run(problem, progress=lambda share: progress(0.3 * share))
     s = smoother.solve(problem, f.x, f.c, progress=lambda share: progress(0.3 + 0.7 * share))
-    out = result(problem, "batch", s.x, s.cov, s.c, s.c_cov, s.nis, s.gated)
+    out = result(problem, "batch", s.x, s.cov, s.c, s.c_cov, s.nis, beyond_gate(problem, s.nis))
     if not s.converged:
         out.warnings.append(f"batch did not converge in {s.iterations} iterations; check the prior and the lever arms")
+    return out
+
+
+def isam2(problem: Problem, progress: Progress) -> Result:
+    """iSAM2 over the whole past: causal estimates, and the last one of every keyframe."""
+    from tbmfg.smoother import batch as smoother
+    from tbmfg.smoother import incremental
+
+    online = incremental.run(problem, None, progress)
+    return _online(problem, "isam2", online, smoother.at(problem, online.last_x, online.c).cov)
+
+
+def fixed_lag(problem: Problem, progress: Progress) -> Result:
+    """iSAM2 over the rig's lag: causal estimates, and the last one of every keyframe before it left."""
+    from tbmfg.smoother import incremental
+
+    online = incremental.run(problem, problem.rig.lag_s, progress)
+    return _online(problem, "fixed-lag", online, online.last_cov)
+
+
+def _online(problem: Problem, name: str, online: Online, last_cov: Floats) -> Result:
+    """Result of an online solver: counts at the last estimates, and where it had to start again."""
+    from tbmfg.outcome import beyond_gate, result, trajectory
+
+    gated = beyond_gate(problem, online.nis)
+    out = result(problem, name, online.causal_x, online.causal_cov, online.c, online.c_cov, online.nis, gated)
+    out.smoothed = trajectory(problem, online.last_x, last_cov)
+    out.warnings += [
+        f"{name} was started again at {problem.keyframes_s[k]:.1f} s: {reason}" for k, reason in online.reanchored
+    ]
     return out
 
 
@@ -61,6 +93,18 @@ ESTIMATORS: dict[str, Estimator] = {
         "smooths the whole log: Gauss-Newton over GTSAM's IMU factors and all sensors",
         ("imu",),
         "Dellaert & Kaess (2017); Forster et al. (2017)",
+    ),
+    "fixed-lag": Estimator(
+        fixed_lag,
+        "smooths online over the rig's lag_s seconds: GTSAM's incremental fixed-lag smoother",
+        ("imu",),
+        "Kaess et al. (2012); Dong-Si & Mourikis (2011)",
+    ),
+    "isam2": Estimator(
+        isam2,
+        "smooths online over the whole past: GTSAM's iSAM2 with QR",
+        ("imu",),
+        "Kaess et al. (2012)",
     ),
     "ins": Estimator(
         ins,

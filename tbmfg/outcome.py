@@ -6,9 +6,10 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from tbmfg.geometry import quat_from_matrix
-from tbmfg.problem import Problem
+from tbmfg.problem import GATE, Problem
 from tbmfg.state import NAV, ROT, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats
 
@@ -49,7 +50,7 @@ def result(
     return Result(
         estimator=estimator,
         trajectory=path,
-        calibration={**problem.calibration, **calibrations(problem, c, sd), **_drifts(problem, x, cov)},
+        calibration={**calibrations(problem, c, sd), **_drifts(problem, x, cov)},
         counts=_counts(problem, gated),
         innovations=innovations,
         intervals=list(problem.intervals),
@@ -57,17 +58,23 @@ def result(
     )
 
 
+def beyond_gate(problem: Problem, nis: dict[str, Floats]) -> dict[str, np.ndarray]:
+    """Which rows lie beyond the gate, by sensor."""
+    return {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+
+
 def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrated]:
-    """Parameters under their public names: vectors together, units in the name."""
+    """Parameters under their public names: vectors together, units in the name. A clock offset that this estimator has
+    not estimated (sd 0) is the one that ``prepare`` found."""
     names, free = problem.parameters.names, set(problem.parameters.free)
-    found: dict[str, Calibrated] = {}
+    found: dict[str, Calibrated] = dict(problem.calibration)
     for k, name in enumerate(names):
         sensor, _, what = name.rpartition(".")
         estimated = k in free
         if what == "arm_x":
             three = slice(k, k + 3)
             found[f"{sensor}_lever_arm_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
-        elif what == "clock_offset":
+        elif what == "clock_offset" and (sd[k] > 0 or f"{sensor}_clock_offset_s" not in found):
             found[f"{sensor}_clock_offset_s"] = Calibrated(c[k] + problem.clock_offset_s[sensor], sd[k], estimated)
         elif what == "yaw":
             degrees = np.rad2deg(c[k : k + 2]), np.rad2deg(sd[k : k + 2])
@@ -104,7 +111,8 @@ def _counts(problem: Problem, gated: dict[str, np.ndarray]) -> dict[str, Counts]
 def _unobserved(problem: Problem, sd: Floats) -> list[str]:
     parameters = problem.parameters
     return [
-        f"{parameters.names[k]} is not observable on this log: its sd stays {sd[k]:.3g} of the prior's {parameters.sd[k]:.3g}"
+        f"{parameters.names[k]} is not observable on this log: "
+        f"its sd stays {sd[k]:.3g} of the prior's {parameters.sd[k]:.3g}"
         for k in parameters.free
         if sd[k] > UNOBSERVED * parameters.sd[k]
     ]
@@ -121,6 +129,6 @@ def _vague_heading(path: Trajectory) -> list[str]:
     t = (path.t_ns - path.t_ns[0]) * 1e-9
     span = t[vague]
     return [
-        f"heading is known to {np.rad2deg(sd[vague].max()):.0f} deg only, {span[0]:.0f}-{span[-1]:.0f} s ({vague.mean():.0%} of the "
-        "keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by the prism would fix it"
+        f"heading is known to {np.rad2deg(sd[vague].max()):.0f} deg only, {span[0]:.0f}-{span[-1]:.0f} s "
+        f"({vague.mean():.0%} of the keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by the prism would fix it"
     ]

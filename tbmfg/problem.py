@@ -12,7 +12,6 @@ from tbmfg.sensors import Rows
 from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Times
 
-
 GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are counted as gated
 
 
@@ -44,19 +43,30 @@ class Parameters:
 class Inertial:
     """Compensated steps with their noise, and the field they are integrated in.
 
-    ``gyro`` and ``acc`` (n, 3) in b; ``psd_gyro``, ``psd_acc`` (n,) white noise [unit^2/Hz];
-    ``psd_bg``, ``psd_ba`` bias random walks; ``earth_n`` rad/s, ``gravity_n`` m/s^2, (3,).
+    ``gyro`` and ``acc`` (n, 3) in b; ``white_gyro``, ``white_acc`` the IMU's white noise [unit^2/Hz], to which steps
+    that stand in for lost samples add theirs; ``psd_bg``, ``psd_ba`` bias random walks; ``earth_n`` rad/s,
+    ``gravity_n`` m/s^2, (3,).
     """
 
     steps: Steps
     gyro: Floats
     acc: Floats
-    psd_gyro: Floats
-    psd_acc: Floats
+    white_gyro: float
+    white_acc: float
     psd_bg: float
     psd_ba: float
     earth_n: Floats
     gravity_n: Floats
+
+    @property
+    def psd_gyro(self) -> Floats:
+        """White noise of the gyro by step, (n,)."""
+        return self.white_gyro + self.steps.extra_gyro
+
+    @property
+    def psd_acc(self) -> Floats:
+        """White noise of the accelerometer by step, (n,)."""
+        return self.white_acc + self.steps.extra_acc
 
 
 @dataclass(frozen=True, slots=True)

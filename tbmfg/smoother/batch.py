@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states
-from tbmfg.problem import GATE, Problem
+from tbmfg.problem import Problem
 from tbmfg.smoother import graph
 from tbmfg.smoother.chain import Block, Elimination, eliminate
 from tbmfg.smoother.graph import States
@@ -22,15 +21,14 @@ CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that
 
 @dataclass(frozen=True, slots=True)
 class Smoothed:
-    """States (n, 21 + e) with covariances (n, 15 + e, 15 + e), calibrations with covariance; by sensor and row the
-    squared normalised residuals at the solution, and which of them lie beyond the gate."""
+    """States (n, 21 + e) with covariances (n, 15 + e, 15 + e), calibrations with covariance, and by sensor and row the
+    squared normalised residuals at the solution."""
 
     x: Floats
     cov: Floats
     c: Floats
     c_cov: Floats
     nis: dict[str, Floats]
-    gated: dict[str, np.ndarray]
     iterations: int
     converged: bool
 
@@ -64,12 +62,25 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
                 break
         if progress is not None:
             progress(iteration / (iteration + 3))
-    chain = eliminate(blocks, n, d, m)
-    cov, free_cov = chain.covariances()
-    c_cov = np.zeros((len(states.c), len(states.c)))
+    cov, c_cov = _covariances(problem, blocks, free)
+    return Smoothed(states.x, cov, states.c, c_cov, nis, iteration, converged)
+
+
+def at(problem: Problem, x: Floats, c: Floats) -> Smoothed:
+    """Covariances and residuals of the whole graph at given states: those of a solver that ends there."""
+    free, states = problem.parameters.free, States(x, c)
+    blocks, nis, _ = _linearise(problem, (graph.imu_graph(problem, x), graph.no_bias(len(x))), states, free)
+    cov, c_cov = _covariances(problem, blocks, free)
+    return Smoothed(x, cov, c, c_cov, nis, 0, True)
+
+
+def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tuple[Floats, Floats]:
+    """Covariances of all keyframes, and of all constants (zero for known ones)."""
+    m = len(problem.parameters.names)
+    cov, free_cov = eliminate(blocks, len(problem.keyframe_edges), problem.size, len(free)).covariances()
+    c_cov = np.zeros((m, m))
     c_cov[np.ix_(free, free)] = free_cov
-    gated = {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
-    return Smoothed(states.x, cov, states.c, c_cov, nis, gated, iteration, converged)
+    return cov, c_cov
 
 
 def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block], dict[str, Floats], float]:

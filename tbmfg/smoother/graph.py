@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -30,31 +29,36 @@ class States:
 
 
 def imu_graph(problem: Problem, x: Floats) -> gtsam.NonlinearFactorGraph:
-    """CombinedImuFactor between neighbours, preintegrated at the biases of ``x``."""
-    inertial, edges = problem.inertial, problem.keyframe_edges
-    base, steps_dt = _parameters(problem, 0.0, 0.0), problem.inertial.steps.dt
-    typical = inertial.psd_gyro.min(), inertial.psd_acc.min()
+    """CombinedImuFactor between neighbours, preintegrated at the biases of ``x`` (n, 21 + e)."""
     graph = gtsam.NonlinearFactorGraph()
-    for k, (first, last) in enumerate(pairwise(edges)):
-        rows = slice(first, last)
-        dt = steps_dt[rows]
-        # steps that stand in for lost samples: their extra noise, spread over the interval
-        extra_gyro = float(np.sum((inertial.psd_gyro[rows] - typical[0]) * dt) / dt.sum())
-        extra_acc = float(np.sum((inertial.psd_acc[rows] - typical[1]) * dt) / dt.sum())
-        plain = extra_gyro <= 0.0 and extra_acc <= 0.0
-        parameters = base if plain else _parameters(problem, extra_gyro, extra_acc)
-        pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(x[k, 15:18], x[k, 18:21]))
-        for acc, gyro, step in zip(inertial.acc[rows], inertial.gyro[rows], dt, strict=True):
-            pim.integrateMeasurement(acc, gyro, step)
+    base = _parameters(problem, 0.0, 0.0)
+    for k in range(len(problem.keyframe_edges) - 1):
+        pim = preintegrate(problem, k, x[k], base)
         graph.add(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), pim))
     return graph
+
+
+def preintegrate(
+    problem: Problem, k: int, x: Floats, base: gtsam.PreintegrationCombinedParams | None = None
+) -> gtsam.PreintegratedCombinedMeasurements:
+    """IMU between keyframes k and k + 1 at the biases of ``x`` (21 + e,); ``base``: parameters without extra noise."""
+    inertial = problem.inertial
+    rows = slice(*problem.keyframe_edges[k : k + 2])
+    dt = np.diff(inertial.steps.edges_s[rows.start : rows.stop + 1])
+    # steps that stand in for lost samples: their extra noise, spread over the interval
+    extra = [float(v[rows] @ dt / dt.sum()) for v in (inertial.steps.extra_gyro, inertial.steps.extra_acc)]
+    parameters = base if base is not None and not any(extra) else _parameters(problem, *extra)
+    pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(x[15:18], x[18:21]))
+    for acc, gyro, step in zip(inertial.acc[rows], inertial.gyro[rows], dt, strict=True):
+        pim.integrateMeasurement(acc, gyro, step)
+    return pim
 
 
 def _parameters(problem: Problem, extra_gyro: float, extra_acc: float) -> gtsam.PreintegrationCombinedParams:
     inertial = problem.inertial
     p = gtsam.PreintegrationCombinedParams(inertial.gravity_n)
-    p.setGyroscopeCovariance(np.eye(3) * (inertial.psd_gyro.min() + extra_gyro))
-    p.setAccelerometerCovariance(np.eye(3) * (inertial.psd_acc.min() + extra_acc))
+    p.setGyroscopeCovariance(np.eye(3) * (inertial.white_gyro + extra_gyro))
+    p.setAccelerometerCovariance(np.eye(3) * (inertial.white_acc + extra_acc))
     p.setIntegrationCovariance(np.eye(3) * INTEGRATION_PSD)
     p.setBiasAccCovariance(np.eye(3) * inertial.psd_ba)
     p.setBiasOmegaCovariance(np.eye(3) * inertial.psd_bg)
