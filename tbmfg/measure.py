@@ -19,11 +19,20 @@ RATE_WINDOW_S = 0.02  # the angular rate at a fix is a mean over this much on ei
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Accepted samples of one sensor: stamps in s since the log's first IMU sample (clock offset not removed)."""
+    """Accepted samples of one sensor: stamps in s since the log's first IMU sample (clock offset not removed).
+
+    ``sigma`` (n, 3) is the standard deviation per axis of positions [m], None for other sensors.
+    """
 
     sensor: str
     t_s: Floats
     values: Floats
+    sigma: Floats | None = None
+
+    def select(self, rows: np.ndarray) -> Samples:
+        """Only these rows (index array or mask)."""
+        sigma = None if self.sigma is None else self.sigma[rows]
+        return Samples(self.sensor, self.t_s[rows], self.values[rows], sigma)
 
 
 def keyframe_edges(rule: Keyframes, edges_s: Floats, end_s: float, fixes_s: Floats) -> np.ndarray:
@@ -55,7 +64,7 @@ def nearest(keyframes_s: Floats, t_s: Floats) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class GyroFrame:
-    """Attitude by gyro alone relative to the first edge: carries vectors over the fractions of a second to a keyframe."""
+    """Attitude by gyro alone relative to the first edge: carries vectors over fractions of a second to a keyframe."""
 
     steps: Steps
     R_0t: Floats  # (n + 1, 3, 3)
@@ -85,13 +94,12 @@ def position_rows(
     origin_n: Floats,
     calib: slice,
 ) -> Rows:
-    """Fixes of a prism or antenna at their true times; sigma from the rig at the measured range."""
+    """Fixes of a prism or antenna at their true times."""
     t = fixes.t_s - offset_s
     k = nearest(keyframes_s, t)
     data = np.column_stack([t - keyframes_s[k], frame.rate(t)])
-    sigma = np.repeat(sensor.sigma_at(fixes.values)[:, None], 3, axis=1)
     ones = np.ones(len(t), dtype=int)
-    return Rows(fixes.sensor, "prism", k, k, fixes.values - origin_n, data, sigma, calib, ones, sensor.loss)
+    return Rows(fixes.sensor, "prism", k, k, fixes.values - origin_n, data, fixes.sigma, calib, ones, sensor.loss)
 
 
 def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame: GyroFrame, calib: slice) -> Rows:
@@ -167,7 +175,7 @@ def velocity_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], sig
 
 
 def bounded_rows(keyframes_s: Floats, centre_n: Floats, radius: float, speed: float) -> Rows:
-    """A body that stays within ``radius`` of ``centre_n`` and below ``speed``, both read as one sd, at every keyframe."""
+    """A body that stays within ``radius`` of ``centre_n`` and below ``speed``, read as sds, at every keyframe."""
     k = np.arange(len(keyframes_s))
     z = np.tile(np.concatenate([centre_n, np.zeros(3)]), (len(k), 1))
     sigma = np.tile(np.repeat([radius, speed], 3), (len(k), 1))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from tbmfg.results import (
     write_text,
 )
 from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
+from tbmfg.state import Calibrated, Truth
 from tbmfg.timeseries import NS, Log
 
 Progress = Callable[[str, float], None]
@@ -88,7 +90,7 @@ def run(
         "metrics": None,
     }
     if reference is not None:
-        poses = load_truth(reference, log)
+        poses = truth_for(reference, log, prepared.rig, result.calibration)
         lost = [(prepared.t0_ns + round(start * NS), prepared.t0_ns + round(end * NS)) for _, start, end in outages]
         summary["metrics"] = evaluate(result.trajectory, poses, lost)
         if result.smoothed is not None:
@@ -143,6 +145,18 @@ def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -
         raise TbmfgError("--without imu: every estimator needs the IMU")
     kept = {"imu", *only} if only else set(rig.sensors)
     return tuple(name for name in rig.sensors if name not in kept or name in without)
+
+
+def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Calibrated]) -> Truth:
+    """What :func:`find_truth` found. The rig's own truth is brought to the IMU's clock, and has the rig's arm."""
+    truth = load_truth(reference, log)
+    if rig.truth is None or reference != rig.truth.topic:
+        return truth
+    offset_s = 0.0
+    if clock := rig.truth.clock:
+        found = calibration.get(f"{clock}_clock_offset_s")
+        offset_s = rig.sensors[clock].clock_offset if found is None else found.value
+    return replace(truth, t_ns=truth.t_ns - round(offset_s * NS), arm_b=rig.truth.arm)
 
 
 def peak_rss_mb() -> float | None:

@@ -11,28 +11,36 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tbmfg import earth, measure
+from tbmfg import earth, gnss, measure
 from tbmfg.errors import EstimationError, LogError, RigError
 from tbmfg.filters import ins
-from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy, rotation_z, yaw_of
-from tbmfg.inertial import alignment
+from tbmfg.geometry import rotation_from_rpy, rotation_z, yaw_of
+from tbmfg.inertial import alignment, sanity
 from tbmfg.inertial.noise import spectral_floor
 from tbmfg.inertial.steps import Steps, compensate, make_steps, to_ns
 from tbmfg.inertial.strapdown import rotations
+from tbmfg.mcap.clouds import TYPE as CLOUDS
+from tbmfg.mcap.info import guess_role
 from tbmfg.measure import GyroFrame, Samples
 from tbmfg.problem import Inertial, Parameters, Prior, Problem
-from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, Rig, kind_of
+from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, Prism, Rig, Sensor, kind_of
 from tbmfg.state import NAV, Calibrated, Counts, Interval
-from tbmfg.timeseries import Floats, Log, seconds
+from tbmfg.timeseries import Floats, Log, Series, seconds
 
 Prepared = Problem
 
 VALUES = {  # column of the series that each kind of sensor measures with
     "prism": lambda series: series["point"],
+    "gnss": lambda series: series["point"],
     "odometer": lambda series: series["linear"][:, 0],
     "magnetometer": lambda series: series["field"],
     "barometer": lambda series: pressure_height(series["pressure"]),
 }
+ALONE = (
+    "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer or barometer as well, "
+    "or a motion bound in the rig"
+)
+LEAST_IMU = 3
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
 FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
 SCALE_PRIOR_LOG2 = 0.7  # sd of log2 of the noise against the spectrum's floor, for logs that hardly say
@@ -74,17 +82,22 @@ def prepare(
 ) -> Problem:
     """Everything an estimator needs.
 
-    ``outages`` are (sensor, start, end) in s from the first IMU sample, stamps as recorded; ``without`` names sensors to
-    leave aside. Raises LogError without IMU samples, RigError for names that the rig does not have.
+    ``outages`` are (sensor, start, end) in s from the first IMU sample, stamps as recorded; ``without`` names sensors
+    to leave aside. Raises LogError without IMU samples, RigError for names that the rig does not have.
     """
     tell = progress or (lambda stage, share: None)
     tell("prepare", 0.0)
     for name in [sensor for sensor, _, _ in outages] + list(without):
         if name not in rig.sensors:
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
-    warnings: list[str] = list(log.damage)
+    log, rig, said = gnss.into_n(log, rig)
+    warnings: list[str] = [*log.damage, *_losses(log, rig, without), *said]
     steps, imu_counts = _imu_steps(log, rig)
-    samples, counts = _samples(log, rig, steps, outages, without, warnings)
+    missing: list[str] = []
+    samples, counts = _samples(log, rig, steps, outages, without, missing)
+    if not samples and rig.motion is None:
+        raise EstimationError("; ".join([f"{log.path}: {ALONE}", *missing]))
+    warnings += missing
     counts = {"imu": imu_counts, **counts}
     setup = _align(rig, steps, samples, counts, warnings)
     offsets = {name: rig.sensors[name].clock_offset for name in samples if _is_position(rig, name)}
@@ -116,7 +129,16 @@ def _imu_steps(log: Log, rig: Rig) -> tuple[Steps, Counts]:
         )
     c = series.counts
     counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
-    return make_steps(series, rig.imu.T_bi.R, rig.imu.stamp), counts
+    if len(series) < LEAST_IMU:
+        lost = {"hold NaN": c.nonfinite, "repeat a stamp": c.duplicate, "bear a wrong stamp": c.misdated}
+        why = ", ".join(f"{count} {what}" for what, count in lost.items() if count) or "the log ends there"
+        raise LogError(f"{log.path}: {rig.imu.topic}: {len(series)} usable of {c.received} IMU samples ({why})")
+    units = {"gyro": rig.imu.gyro_scale, "acc": rig.imu.acc_scale}
+    series = replace(series, columns={column: scale * series[column] for column, scale in units.items()})
+    steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
+    if (fault := sanity.fault(steps)) is not None:
+        raise LogError(f"{log.path}: {rig.imu.topic}: {fault}")
+    return steps, counts
 
 
 def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Samples], dict[str, Counts]]:
@@ -127,9 +149,10 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
         if kind == "imu":
             continue
         series = log.series.get(sensor.topic)
-        if series is None:
-            warnings.append(f"{name}: no messages on {sensor.topic}; it is not used")
+        if series is None and sensor.topic not in log.clouds:
+            warnings.append(f"{name}: {_absence(log, kind, sensor.topic)}; it is not used")
             continue
+        series = log.clouds[sensor.topic] if series is None else series
         c = series.counts
         counts[name] = count = Counts(received=c.received, duplicate=c.duplicate, nonfinite=c.nonfinite)
         if name in without or kind not in VALUES:
@@ -155,8 +178,50 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
             )
             count.unused += int(keep.sum())
             continue
-        samples[name] = Samples(name, t[keep], np.ascontiguousarray(VALUES[kind](series)[keep]))
+        try:
+            values = np.ascontiguousarray(VALUES[kind](series))
+        except KeyError:
+            raise LogError(f"{log.path}: {name}: {sensor.topic} is {series.type}, {_instead(log, kind)}") from None
+        samples[name] = Samples(name, t, values, _sigma(sensor, series)).select(keep)
     return samples, counts
+
+
+def _losses(log: Log, rig: Rig, without: tuple[str, ...]) -> list[str]:
+    """What the reader left out of the sensors' messages and the counts do not name."""
+    said = []
+    for name, sensor in rig.sensors.items():
+        source = log.series.get(sensor.topic, log.clouds.get(sensor.topic))
+        if source is None or name in without:
+            continue
+        for count, what in (
+            (source.counts.misdated, "bear a stamp that cannot be right"),
+            (source.counts.undecodable, "cannot be decoded"),
+        ):
+            if count:
+                total = source.counts.received + source.counts.undecodable
+                said.append(f"{name}: {count} of {total} messages on {sensor.topic} {what}; left out")
+    return said
+
+
+def _absence(log: Log, kind: str, topic: str) -> str:
+    """Why there are no samples of a topic, and what could be meant."""
+    if topic in log.unknown:
+        return f"{topic} is {log.unknown[topic]}, which is not read"
+    return f"no messages on {topic}, {_instead(log, kind)}"
+
+
+def _instead(log: Log, kind: str) -> str:
+    """The topics of the log that a kind of sensor could be."""
+    types = {topic: series.type for topic, series in log.series.items()} | dict.fromkeys(log.clouds, CLOUDS)
+    alike = sorted(topic for topic, type in types.items() if guess_role(topic, type) == kind)
+    return f"{kind} topics in the log: {', '.join(alike) or 'none'}"
+
+
+def _sigma(sensor: Sensor, series: Series) -> Floats | None:
+    """Standard deviation per axis of n of positions [m], (n, 3): the fix's own, or a total station's at that range."""
+    if isinstance(sensor, Prism):
+        return np.repeat(sensor.sigma_at(series["point"])[:, None], 3, axis=1)
+    return series["sigma"] if isinstance(sensor, PositionSensor) else None
 
 
 def _parameters(rig: Rig, samples: dict[str, Samples]) -> Parameters:
@@ -208,7 +273,7 @@ def _align(
         )
         if fit is None:
             warnings.append(
-                "heading is not observable: no stretch of 8 s has motion that turns it into a heading; set initial.yaw_deg"
+                "heading is not observable: no stretch of 8 s has motion enough to give it; set initial.yaw_deg"
             )
         else:
             R_start, yaw_sd = rotation_z(fit.heading) @ R_level, max(2.0 * fit.heading_sd, np.deg2rad(5.0))
@@ -263,7 +328,7 @@ def _confirmed_rest(
             values = s.values[rows]
             if isinstance(sensor, PositionSensor):
                 spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
-                resting = bool(np.all(spread < 5.0 * sensor.sigma_at(values)))
+                resting = bool(np.all(spread < 5.0 * s.sigma[rows].max(axis=1)))
             elif isinstance(sensor, Odometer):
                 resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
             else:
@@ -298,7 +363,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
     rig, steps = setup.rig, setup.steps
     end_s = steps.end_s if end_s is None else min(end_s, steps.end_s)
     samples = {
-        name: Samples(name, s.t_s[rows], s.values[rows])
+        name: s.select(rows)
         for name, s in setup.samples.items()
         if (rows := s.t_s - offsets.get(name, 0.0) <= end_s).sum() >= 2
     }
@@ -333,9 +398,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
     if rig.motion is not None:
         rows.append(measure.bounded_rows(keyframes, position, rig.motion.radius, rig.motion.speed))
     if not any(kind_of(r.sensor) != "zero_velocity" for r in rows):
-        raise EstimationError(
-            "nothing but the IMU to go by: no prism, odometer, magnetometer or barometer in the log and no motion bound in the rig"
-        )
+        raise EstimationError(ALONE)
 
     imu = rig.imu
     inertial = Inertial(
@@ -353,7 +416,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
 
 
 def _start(setup: _Setup, offsets: dict[str, float]) -> tuple[Floats, Floats]:
-    """Position (relative to the origin) and velocity in n at the first edge: from the rig, else from the first fixes."""
+    """Position (from the origin) and velocity in n at the first edge: from the rig, else from the first fixes."""
     rig = setup.rig
     position, velocity = rig.initial.position, rig.initial.velocity
     for name, s in setup.samples.items():
@@ -406,7 +469,7 @@ def _search(setup: _Setup, offsets: dict[str, float], tell: Callable[[str, float
         offsets[name] = _coarse_offset(setup, name)
     for turn in range(2 if auto and unknown else 1):
         if unknown:
-            _settle_offsets(setup, offsets, scale * split, unknown)
+            offset_sd = _settle_offsets(setup, offsets, scale * split, unknown)
         if auto:
             scale, sd = _noise_scale(setup, offsets, split, scale)
         tell("prepare", 0.5 + 0.25 * turn)
@@ -415,19 +478,22 @@ def _search(setup: _Setup, offsets: dict[str, float], tell: Callable[[str, float
     named = {"noise_factor_gyro": factors[0], "noise_factor_acc": factors[1], "noise_factor": np.sqrt(np.prod(factors))}
     for key, value in named.items():
         problem.calibration[key] = Calibrated(float(value), float(value * sd / scale), auto)
+    for name in unknown:
+        problem.calibration[f"{name}_clock_offset_s"] = Calibrated(offsets[name], offset_sd[name], True)
     return problem
 
 
-def _settle_offsets(setup: _Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> None:
-    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place."""
+def _settle_offsets(setup: _Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> dict[str, float]:
+    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place; their sds in s."""
     for _ in range(4):
         problem = _build(setup, offsets, factors, SEARCH_S)
-        c = ins.run(problem).c
-        steps = {name: float(c[problem.parameters.names.index(f"{name}.clock_offset")]) for name in unknown}
-        for name, step in steps.items():
-            offsets[name] += step
-        if max(map(abs, steps.values())) < 1e-4:
-            return
+        filtered = ins.run(problem)
+        where = {name: problem.parameters.names.index(f"{name}.clock_offset") for name in unknown}
+        for name, k in where.items():
+            offsets[name] += float(filtered.c[k])
+        if max(abs(filtered.c[k]) for k in where.values()) < 1e-4:
+            break
+    return {name: float(np.sqrt(filtered.c_cov[k, k])) for name, k in where.items()}
 
 
 def _coarse_offset(setup: _Setup, name: str) -> float:

@@ -58,14 +58,25 @@ class Origin(Node):
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] | None = Field(
         None, description="Geodetic latitude; null: no Earth rate is modelled and gravity is the standard one."
     )
-    height_m: Number = Field(0.0, description="Height above the ellipsoid, for gravity; 1 km changes it by 0.03 %.")
+    longitude_deg: Annotated[Number, Field(ge=-180, le=180)] | None = Field(
+        None, description="Where n touches the Earth, for gnss; null: at the first fix of the log."
+    )
+    height_m: Number = Field(0.0, description="Height above the ellipsoid; 1 km changes gravity by 0.03 %.")
     x_axis_azimuth_deg: Number = Field(
         90.0, description="Direction of n's x axis, clockwise from true north; 90: x east, y north."
     )
 
     latitude = si("latitude_deg", DEG)
+    longitude = si("longitude_deg", DEG)
     height = si("height_m")
     x_axis_azimuth = si("x_axis_azimuth_deg", DEG)
+
+    @property
+    def llh(self) -> Floats | None:
+        """Latitude and longitude [rad] and height [m] of n's origin, (3,); None where n lies at the first fix."""
+        if self.latitude is None or self.longitude is None:
+            return None
+        return np.array([self.latitude, self.longitude, self.height])
 
     @property
     def gravity(self) -> float:
@@ -210,15 +221,11 @@ class Prism(PositionSensor):
 
 
 class Gnss(PositionSensor):
-    """Satellite positions; the default sd is that of a fixed RTK solution."""
+    """Satellite positions, turned into n."""
 
-    sigma_m: Positive = Field(0.02, description="Per axis.")
+    sigma_m: Positive | None = Field(None, description="Per axis; null: the covariance that each fix states.")
 
     sigma = si("sigma_m")
-
-    def sigma_at(self, position_n: Floats) -> Floats:
-        """Standard deviation per axis [m] of fixes at ``position_n`` (..., 3) -> (...)."""
-        return np.full(np.shape(position_n)[:-1], self.sigma_m)
 
 
 class Odometer(Sensor):
@@ -345,6 +352,12 @@ class TruthTopic(Node):
     """Where the log holds reference poses. They are compared with, never used."""
 
     topic: Text = Field(description="Odometry or PoseStamped topic.")
+    arm_m: Triple = Field(ZERO, description="From the IMU to the point whose positions they are, in b.")
+    clock: Text | None = Field(
+        None, description="Sensor that shares their clock: its offset, as found, is removed; null: the IMU's clock."
+    )
+
+    arm = si("arm_m")
 
 
 class SurveyPoint(Node):
@@ -388,7 +401,7 @@ class Rig(Node):
     def assumptions(self) -> list[str]:
         """What the rig leaves open and how it is filled: lines to show the user."""
         said = []
-        if self.origin.latitude_deg is None:
+        if self.origin.latitude_deg is None and not self.of_kind("gnss"):
             said.append(f"origin.latitude_deg is not given: no Earth rate, standard gravity {STANDARD_GRAVITY} m/s^2")
         if self.initial.yaw_deg is not None and self.initial.yaw_sd_deg >= 180:
             said.append(f"initial.yaw_deg {self.initial.yaw_deg:g} has no weight: yaw_sd_deg is 180")
@@ -433,6 +446,12 @@ class Rig(Node):
             other = first_with.setdefault(sensor.topic, name)
             if other != name:
                 faults.append(fault(("sensors", name, "topic"), f"{sensor.topic} is already the topic of {other}"))
+        if self.origin.longitude_deg is not None and self.origin.latitude_deg is None:
+            faults.append(fault(("origin", "longitude_deg"), "should come with latitude_deg"))
+        clock = self.truth and self.truth.clock
+        if clock and not hasattr(self.sensors.get(clock), "clock_offset_s"):
+            timed = ", ".join(name for name, sensor in self.sensors.items() if hasattr(sensor, "clock_offset_s"))
+            faults.append(fault(("truth", "clock"), f"should be a sensor with a clock offset ({timed or 'none here'})"))
         if (self.initial.roll_deg is None) != (self.initial.pitch_deg is None):
             faults.append(fault(("initial",), "roll_deg and pitch_deg should be given together or not at all"))
         return or_raise(self, faults)

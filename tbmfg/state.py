@@ -40,12 +40,16 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Reference poses of b in n. ``quat_xyzw`` and ``velocity_n`` are None where the log has none."""
+    """Reference poses of b in n. ``quat_xyzw`` and ``velocity_n`` are None where the log has none.
+
+    With ``arm_b`` (3,) m, positions and velocities are those of a point at this arm from the IMU.
+    """
 
     t_ns: Times
     position_n: Floats
     quat_xyzw: Floats | None = None
     velocity_n: Floats | None = None
+    arm_b: Floats = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(slots=True)

@@ -17,7 +17,7 @@ WIDTHS = {
     "sensor_msgs/msg/Imu": {"gyro": 3, "acc": 3, "quat_xyzw": 4},
     "sensor_msgs/msg/MagneticField": {"field": 3},
     "sensor_msgs/msg/FluidPressure": {"pressure": 1, "variance": 1},
-    "sensor_msgs/msg/NavSatFix": {"llh": 3, "cov": 9, "status": 1},
+    "sensor_msgs/msg/NavSatFix": {"llh": 3, "cov": 9, "cov_type": 1, "status": 1},
     "geometry_msgs/msg/PointStamped": {"point": 3},
     "geometry_msgs/msg/TwistStamped": {"linear": 3, "angular": 3},
     "geometry_msgs/msg/TwistWithCovarianceStamped": {"linear": 3, "angular": 3, "cov": 36},
@@ -49,6 +49,7 @@ def sample(type: str, n: int, seed: int = 0, frame_id: str = "sensor") -> Series
     }
     if "status" in columns:
         columns["status"] = rng.integers(-1, 3, n).astype(float)
+        columns["cov_type"] = rng.integers(0, 4, n).astype(float)
     if "quat_xyzw" in columns:
         columns["quat_xyzw"] /= np.linalg.norm(columns["quat_xyzw"], axis=1, keepdims=True)
     t_ns = START_NS + rng.integers(1, 20_000_000, n).cumsum()
@@ -102,7 +103,12 @@ def stock_columns(type: str, message) -> dict[str, list[float]]:
         return {"pressure": message.fluid_pressure, "variance": message.variance}
     if kind == "NavSatFix":
         llh = [message.latitude, message.longitude, message.altitude]
-        return {"llh": llh, "cov": list(message.position_covariance), "status": message.status.status}
+        return {
+            "llh": llh,
+            "cov": list(message.position_covariance),
+            "cov_type": message.position_covariance_type,
+            "status": message.status.status,
+        }
     if kind == "PointStamped":
         return {"point": xyz(message.point)}
     if kind == "TwistStamped":

@@ -16,7 +16,7 @@ LEVELS = (
     ("geometry", "earth", "fields"),
     ("state", "rig"),
     ("sensors", "mcap", "inertial", "lidar", "evaluation"),
-    ("measure", "results", "inference"),
+    ("measure", "gnss", "results", "inference"),
     ("problem",),
     ("filters", "smoother", "outcome"),
     ("prepare",),

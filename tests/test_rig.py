@@ -108,7 +108,7 @@ def test_unknown_name_is_refused_with_what_there_is(tmp_path):
         (MINIMAL + "\nlag_s: 3\nlag_s: 4", "rig.yaml:3: lag_s: is given twice, first in line 2"),
         (
             MINIMAL + "\norigin:\n  latitud_deg: 3",
-            "rig.yaml:3: origin.latitud_deg: unknown key; did you mean latitude_deg?",
+            "rig.yaml:3: origin.latitud_deg: unknown key; did you mean latitude_deg or longitude_deg?",
         ),
         (
             MINIMAL + "\norigin: {latitude_deg: 91}",

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
 from tbmfg.evaluation.correlation import effective_samples
-from tbmfg.geometry import split_yaw_tilt
-from tbmfg.state import POS, Trajectory, Truth
+from tbmfg.geometry import skew, split_yaw_tilt
+from tbmfg.state import POS, ROT, Trajectory, Truth
 from tbmfg.timeseries import Floats, Times
 
 GAP_RATIO = 5.0  # a truth interval this many times the median is a gap ...
@@ -47,6 +47,8 @@ def evaluate(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, 
     ``outage_position_rms_m`` and the NEES compare coordinates as they are: they mean something when truth
     and estimate are given in the same frame n, which the rig asserts. ``outages`` are (start, end) stamps
     in ns, both included. ``velocity_rms_mps`` needs a true velocity; positions are not differentiated.
+    Where the truth is that of a point with an arm, so are the positions compared; no velocity is, because a
+    trajectory holds no angular rate.
     ``evaluated`` counts the keyframes that the truth covers; ``nees_evaluated`` those of them with a
     covariance that can be inverted; ``nees_n_eff`` is the number of independent samples among these.
     """
@@ -78,6 +80,8 @@ def evaluate(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, 
 
 def trajectory_errors(trajectory: Trajectory, truth: Truth) -> Errors:
     """Errors at the keyframes that the truth covers."""
+    if truth.arm_b.any():
+        trajectory, truth = at_point(trajectory, truth.arm_b), replace(truth, velocity_n=None)
     covered, true = truth_at(truth, trajectory.t_ns)
     rows = np.flatnonzero(covered)
     estimate_n = trajectory.position_n[rows]
@@ -105,6 +109,15 @@ def trajectory_errors(trajectory: Trajectory, truth: Truth) -> Errors:
         nees=nees(error, cov),
         nees_dof=error.shape[1],
     )
+
+
+def at_point(trajectory: Trajectory, arm_b: Floats) -> Trajectory:
+    """The trajectory with positions p + R arm, those of a point at ``arm_b`` (3,) m, and the covariance of these."""
+    R = trajectory.rotations()
+    J = np.tile(np.eye(trajectory.cov.shape[1]), (len(trajectory), 1, 1))
+    J[:, POS, ROT] = -R @ skew(arm_b)
+    cov = J @ trajectory.cov @ J.transpose(0, 2, 1)
+    return replace(trajectory, position_n=trajectory.position_n + R @ arm_b, cov=cov)
 
 
 def truth_at(truth: Truth, t_ns: Times) -> tuple[np.ndarray, Truth]:
