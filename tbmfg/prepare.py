@@ -403,7 +403,7 @@ def _build(setup: _Setup, offsets: dict[str, float], factors: Floats, end_s: flo
     imu = rig.imu
     inertial = Inertial(
         steps, setup.gyro, setup.acc,
-        (factors[0] * imu.gyro_density) ** 2 + steps.extra_gyro, (factors[1] * imu.acc_density) ** 2 + steps.extra_acc,
+        (factors[0] * imu.gyro_density) ** 2, (factors[1] * imu.acc_density) ** 2,
         imu.gyro_walk**2, imu.acc_walk**2, rig.origin.rate_n, np.array([0.0, 0.0, -rig.origin.gravity]),
     )  # fmt: skip
     drift = np.array(drift_start) - setup.origin_n[2] - position[2] if drift_names else np.zeros(0)
