@@ -82,6 +82,8 @@ def fit_motion(
     cos and sin of the heading. The offset of ``offsets_s`` with the least total log residual wins. ``t_s`` are
     stamps in s since ``steps.t0_ns``. Returns None when no window turns the motion into a heading.
     """
+    known_s = 0.5 * float(np.min(offsets_s) + np.max(offsets_s))  # windows shrink by what is open, not by this
+    t_s, offsets_s = t_s - known_s, offsets_s - known_s
     moving = _windows(t_s, position_n, window_s, max_windows, steps.end_s, offsets_s)
     if not moving:
         return None
@@ -104,7 +106,7 @@ def fit_motion(
     mean = np.sum(weight * np.exp(1j * angle[keep])) / weight.sum()
     spread = np.sqrt(max(-2.0 * np.log(min(abs(mean), 1.0)), 0.0))
     heading_sd = float(np.hypot(spread, 1.0 / np.sqrt(weight.sum())))
-    return MotionFit(float(np.angle(mean)), heading_sd, float(_vertex(offsets_s, profiles, best)))
+    return MotionFit(float(np.angle(mean)), heading_sd, known_s + float(_vertex(offsets_s, profiles, best)))
 
 
 def _windows(t_s, position_n, window_s, max_windows, end_s, offsets_s):
