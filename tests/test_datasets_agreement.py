@@ -52,9 +52,11 @@ def test_odometer(drive):
     x, y = packed(drive, starts_s), packed(drive, starts_s + 1)
     R_start = drive.truth(starts_s).R
     R_middle = drive.truth((np.arange(1200) + 0.5) * dt).R.reshape(60, 20, 3, 3)
-    M = np.einsum("nji,nmjk,nm->nik", R_start, R_middle, speed.reshape(60, 20) * dt)
-    data = np.hstack([M.reshape(-1, 9), np.tile(arm, (60, 1)), np.zeros((60, 6))])
-    residual, *_ = sensors.odometer(np.zeros((60, 0)), data, x, y, np.array([scale, 0.0, 0.0]))
+    way = np.einsum("nji,nmj,nm->nmi", R_start, R_middle[:, :, :, 0], speed.reshape(60, 20) * dt)
+    D = way.sum(axis=1)
+    B = np.einsum("nmi,m->ni", way, (np.arange(20) + 0.5) * dt)
+    data = np.hstack([np.tile(arm, (60, 1)), B, np.zeros((60, 3)), D])
+    residual, *_ = sensors.odometer(D, data, x, y, np.array([scale, 0.0, 0.0]))
     # turning (0.06 rad/s) and speeding up (0.12 m/s^2) together within a sample: dt^3 / 12 of their product, 20 samples
     assert_allclose(residual, 0.0, atol=20 * 0.06 * 0.12 * dt**3 / 12)
     travelled = np.linalg.norm(y[:, 9:12] - x[:, 9:12], axis=1)
