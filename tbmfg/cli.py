@@ -26,7 +26,8 @@ app = typer.Typer(
 
 LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="An .mcap file or a rosbag2 folder.", show_default=False)]
 RigName = Annotated[
-    str | None, typer.Option("--rig", metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess.")
+    str | None,
+    typer.Option("--rig", metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess."),
 ]
 Truth = Annotated[
     str, typer.Option(metavar="auto|none|TOPIC|FILE", help="Reference to compare with; auto: the rig's, or by name.")
@@ -106,16 +107,8 @@ def run(
     debug: Debug = False,
 ) -> None:
     """Estimate the trajectory of one log and write it to a folder."""
-    options = {
-        "outages": [parse_outage(text) for text in outage],
-        "without": [name for names in without for name in split_names(names)],
-        "only": split_names(only),
-        "overrides": [checked_override(text) for text in overrides],
-    }
-    from tbmfg.estimators import ESTIMATORS
-
-    if estimator not in ESTIMATORS:
-        raise typer.BadParameter(f"no {estimator!r}; there are {', '.join(ESTIMATORS)}", param_hint="--estimator")
+    options = _options(outage, without, only, overrides)
+    _known(estimator, "--estimator")
     with _errors_in_one_line(debug):
         from tbmfg import pipeline
 
@@ -124,6 +117,37 @@ def run(
                 log, rig=rig, estimator=estimator, truth=truth, output=output, force=force, progress=progress, **options
             )
         _print_summary(summary, output)
+
+
+@app.command()
+def compare(
+    log: LogPath,
+    output: Output,
+    rig: RigName = None,
+    estimators: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Names from `tbmfg estimators`.")
+    ] = "batch,fixed-lag,ins",
+    truth: Truth = "auto",
+    outage: Outages = [],  # noqa: B006
+    without: Without = [],  # noqa: B006
+    only: Only = "",
+    overrides: Overrides = [],  # noqa: B006
+    force: Force = False,
+    debug: Debug = False,
+) -> None:
+    """Run several estimators on one prepared log, side by side."""
+    options = _options(outage, without, only, overrides)
+    names = split_names(estimators)
+    for name in names:
+        _known(name, "--estimators")
+    with _errors_in_one_line(debug):
+        from tbmfg import pipeline
+
+        with _progress_bar() as progress:
+            summaries = pipeline.compare(
+                log, rig=rig, estimators=names, truth=truth, output=output, force=force, progress=progress, **options
+            )
+        _print_comparison(summaries, output)
 
 
 @app.command()
@@ -137,6 +161,24 @@ def estimators(debug: Debug = False) -> None:
 
 
 # ---- reading options ----
+
+
+def _options(outage: list[str], without: list[str], only: str, overrides: list[str]) -> dict[str, Any]:
+    """What ``run`` and ``compare`` share, parsed."""
+    return {
+        "outages": [parse_outage(text) for text in outage],
+        "without": [name for names in without for name in split_names(names)],
+        "only": split_names(only),
+        "overrides": [checked_override(text) for text in overrides],
+    }
+
+
+def _known(estimator: str, hint: str) -> None:
+    """Refuse a name that no estimator has."""
+    from tbmfg.estimators import ESTIMATORS
+
+    if estimator not in ESTIMATORS:
+        raise typer.BadParameter(f"no {estimator!r}; there are {', '.join(ESTIMATORS)}", param_hint=hint)
 
 
 def parse_outage(text: str) -> tuple[str, float, float]:
@@ -228,6 +270,56 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
     typer.echo(f"results: {output}")
 
 
+COMPARED = {  # column title: key of the metrics and the factor to the title's unit
+    "APE mm": ("ape_rms_m", 1e3),
+    "position mm": ("position_rms_m", 1e3),
+    "outage mm": ("outage_position_rms_m", 1e3),
+    "attitude deg": ("attitude_rms_deg", 1.0),
+    "yaw deg": ("yaw_rms_deg", 1.0),
+    "velocity mm/s": ("velocity_rms_mps", 1e3),
+    "NEES": ("nees_mean", 1.0),
+}
+
+
+def _print_comparison(summaries: dict[str, dict[str, Any]], output: Path) -> None:
+    """One row per trajectory: an online solver has a causal one and its last estimates."""
+    ran = {name: summary for name, summary in summaries.items() if "not_run" not in summary}
+    first = next(iter(ran.values()))
+    typer.echo(f"{first['log']}: {first['keyframes']} keyframes over {first['duration_s']:.1f} s, rig {first['rig']}")
+    rows: list[tuple[str, dict[str, Any], float]] = []
+    for name, summary in ran.items():
+        own_s = summary["wall_s"] - summary["shared_s"]
+        smoothed = summary.get("metrics_smoothed")
+        rows.append((f"{name} (causal)" if smoothed else name, summary["metrics"] or {}, own_s))
+        if smoothed:
+            rows.append((f"{name} (last)", smoothed, own_s))
+    titles = [t for t, (key, _) in COMPARED.items() if any(metrics.get(key) is not None for _, metrics, _ in rows)]
+    _print_table(
+        ["estimator", *titles, "own time s"],
+        [
+            (
+                name,
+                *(
+                    _number(None if metrics.get(COMPARED[t][0]) is None else metrics[COMPARED[t][0]] * COMPARED[t][1])
+                    for t in titles
+                ),
+                f"{own_s:.2f}",
+            )
+            for name, metrics, own_s in rows
+        ],
+        justify="right",
+    )
+    if first["metrics"] is not None:
+        typer.echo(f"against {first['truth']}; NEES of a consistent estimator: {first['metrics']['nees_dof']}")
+    typer.echo(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
+    for name, summary in summaries.items():
+        if "not_run" in summary:
+            typer.echo(f"{name} not run: {summary['not_run']}")
+    for warning in dict.fromkeys(warning for summary in ran.values() for warning in summary["warnings"]):
+        typer.echo(f"warning: {warning}")
+    typer.echo(f"results: {output}")
+
+
 def _print_table(header: list[str], rows: list[tuple[str, ...]], *, justify: str = "left") -> None:
     """Columns under their titles, all but the first justified; nothing where there are no rows."""
     if not rows:
@@ -240,7 +332,9 @@ def _print_table(header: list[str], rows: list[tuple[str, ...]], *, justify: str
         table.add_column(title, overflow="fold", justify=justify if column else "left")
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, markup=False).print(table)
+    # a pipe has no width: rows stay on one line there
+    width = None if sys.stdout.isatty() else 200
+    Console(highlight=False, markup=False, width=width).print(table)
 
 
 def _number(value: float | tuple[float, ...] | None) -> str:

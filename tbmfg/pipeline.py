@@ -5,100 +5,195 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tbmfg import __version__
-from tbmfg.errors import RigError, TbmfgError
+from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.results import (
     find_truth,
     load_truth,
     refuse_existing,
     refuse_existing_file,
     summarise,
+    to_json,
     write_result,
     write_text,
 )
-from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
-from tbmfg.state import Calibrated, Truth
+from tbmfg.rig import Rig, dump_rig, kind_of, load_rig, override, parse_rig
+from tbmfg.state import Calibrated, Result, Truth
 from tbmfg.timeseries import NS, Log
+
+if TYPE_CHECKING:
+    from tbmfg.problem import Problem
 
 Progress = Callable[[str, float], None]
 Outage = tuple[str, float, float]
 
 ATTACHED_RIG = "rig.yaml"
+COMPARISON = "compare.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One log, prepared once: what every estimator of a run or a comparison is given."""
+
+    log: Log
+    log_path: str
+    prepared: Problem
+    reference: str | None
+    assumed: tuple[str, ...]
+    options: dict[str, Any]
+    shared_s: float
+
+    def estimate(self, name: str, progress: Progress | None = None) -> tuple[Result, dict[str, Any]]:
+        """Result and summary of one estimator. ``wall_s`` runs from opening the log to the result, reading and
+        preparing (``shared_s``) among it: without evaluating, writing and the imports that can be done before."""
+        from tbmfg.estimators import estimate
+        from tbmfg.evaluation.metrics import evaluate
+
+        started = time.perf_counter()
+        result = estimate(name, self.prepared, progress=progress)
+        wall_s = self.shared_s + time.perf_counter() - started
+
+        result.warnings = list(dict.fromkeys([*self.assumed, *self.prepared.warnings, *result.warnings]))
+        span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
+        summary: dict[str, Any] = {
+            "tbmfg_version": __version__,
+            "log": self.log_path,
+            "rig": self.prepared.rig.name,
+            "estimator": name,
+            "truth": self.reference,
+            "options": self.options,
+            "keyframes": len(result.trajectory),
+            "duration_s": span_ns / NS,
+            "wall_s": wall_s,
+            "shared_s": self.shared_s,
+            "realtime_factor": span_ns / NS / wall_s,
+            "peak_rss_mb": peak_rss_mb(),
+            **summarise(result, self.prepared.t0_ns),
+            "metrics": None,
+        }
+        if self.reference is not None:
+            poses = truth_for(self.reference, self.log, self.prepared.rig, result.calibration)
+            t0_ns = self.prepared.t0_ns
+            lost = [(t0_ns + round(start * NS), t0_ns + round(end * NS)) for _, start, end in self.options["outages"]]
+            summary["metrics"] = evaluate(result.trajectory, poses, lost)
+            if result.smoothed is not None:
+                summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
+        return result, summary
+
+
+def open_session(
+    log_path: str | Path,
+    *,
+    rig: Rig | str | Path | None = None,
+    truth: str = "auto",
+    outages: Sequence[Outage] = (),
+    without: Collection[str] = (),
+    only: Collection[str] = (),
+    overrides: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Session:
+    """Read and prepare a log; the arguments are those of :func:`run`."""
+    from tbmfg.mcap import read_log
+    from tbmfg.prepare import prepare
+
+    started = time.perf_counter()
+    log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
+    rig, assumed = rig_for(log, rig, overrides)
+    dropped = dropped_sensors(rig, without, only)
+    reference = find_truth(truth, log, rig)
+    prepared = prepare(log, rig, outages=tuple(outages), without=dropped, progress=progress)
+    options = {"outages": list(outages), "without": dropped, "set": list(overrides)}
+    shared_s = time.perf_counter() - started
+    return Session(log, str(log_path), prepared, reference, tuple(assumed), options, shared_s)
 
 
 def run(
     log_path: str | Path,
     *,
-    rig: Rig | str | Path | None = None,
     estimator: str = "batch",
-    truth: str = "auto",
     output: str | Path | None = None,
-    outages: Sequence[Outage] = (),
-    without: Collection[str] = (),
-    only: Collection[str] = (),
-    overrides: Sequence[str] = (),
     force: bool = False,
     progress: Progress | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files.
 
-    ``rig``: a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
-    ``outages``: (sensor, start, end) in seconds from the first IMU sample, stamps as recorded. ``without`` drops
-    sensors, ``only`` keeps just these and the IMU. ``overrides``: ``key.path=value`` over the rig. ``progress`` is
-    called with the stage and the done fraction of it. ``wall_s`` is the time from opening the log to the result:
-    without evaluating, writing and the imports that can be done before.
+    ``options``: ``rig``, a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
+    ``truth``: auto, none, a topic or a file. ``outages``: (sensor, start, end) in seconds from the first IMU sample,
+    stamps as recorded. ``without`` drops sensors, ``only`` keeps just these and the IMU. ``overrides``:
+    ``key.path=value`` over the rig. ``progress`` is called with the stage and the done fraction of it.
     """
-    from tbmfg.estimators import ESTIMATORS, estimate
-    from tbmfg.evaluation.metrics import evaluate
-    from tbmfg.mcap import read_log
-    from tbmfg.prepare import prepare
-
-    if estimator not in ESTIMATORS:
-        raise TbmfgError(f"no estimator {estimator!r}; there are {', '.join(ESTIMATORS)}")
+    known_estimators([estimator])
     if output is not None:
         refuse_existing(output, force)
-
-    started = time.perf_counter()
-    log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
-    rig, assumed = rig_for(log, rig, overrides)
-    without = dropped_sensors(rig, without, only)
-    reference = find_truth(truth, log, rig)
-    prepared = prepare(log, rig, outages=tuple(outages), without=without, progress=progress)
-    result = estimate(estimator, prepared, progress=progress)
-    wall_s = time.perf_counter() - started
-
-    result.warnings = list(dict.fromkeys([*assumed, *prepared.warnings, *result.warnings]))
-    span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
-    summary: dict[str, Any] = {
-        "tbmfg_version": __version__,
-        "log": str(log_path),
-        "rig": prepared.rig.name,
-        "estimator": estimator,
-        "truth": reference,
-        "options": {"outages": list(outages), "without": without, "set": list(overrides)},
-        "keyframes": len(result.trajectory),
-        "duration_s": span_ns / NS,
-        "wall_s": wall_s,
-        "realtime_factor": span_ns / NS / wall_s,
-        "peak_rss_mb": None,
-        **summarise(result, prepared.t0_ns),
-        "metrics": None,
-    }
-    if reference is not None:
-        poses = truth_for(reference, log, prepared.rig, result.calibration)
-        lost = [(prepared.t0_ns + round(start * NS), prepared.t0_ns + round(end * NS)) for _, start, end in outages]
-        summary["metrics"] = evaluate(result.trajectory, poses, lost)
-        if result.smoothed is not None:
-            summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
-    summary["peak_rss_mb"] = peak_rss_mb()
+    session = open_session(log_path, progress=progress, **options)
+    result, summary = session.estimate(estimator, progress)
     if output is not None:
-        write_result(output, result, summary, dump_rig(prepared.rig), force=force)
+        write_result(output, result, summary, dump_rig(session.prepared.rig), force=force)
     return summary
+
+
+def compare(
+    log_path: str | Path,
+    *,
+    estimators: Sequence[str],
+    output: str | Path | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
+) -> dict[str, dict[str, Any]]:
+    """Run several estimators on one prepared log: {estimator: summary}, or {"not_run": why} for one that could not.
+
+    With ``output`` every estimator's files go to a folder of its name, and compare.json beside them. The other
+    arguments are those of :func:`run`. Raises TbmfgError when none ran.
+    """
+    known_estimators(estimators)
+    if output is not None:
+        refuse_existing_file(Path(output) / COMPARISON, force)
+        for name in estimators:
+            refuse_existing(Path(output) / name, force)
+    session = open_session(log_path, progress=progress, **options)
+    summaries: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(estimators):
+        reason = unmet(name, session.prepared)
+        if reason is None:
+            try:
+                result, summaries[name] = session.estimate(name, progress)
+            except EstimationError as error:
+                reason = str(error)
+        if reason is not None:
+            summaries[name] = {"not_run": reason}
+        elif output is not None:
+            rig = dump_rig(session.prepared.rig)
+            write_result(Path(output) / name, result, summaries[name], rig, force=force)
+    if all("not_run" in summary for summary in summaries.values()):
+        raise TbmfgError(f"{log_path}: none ran: " + "; ".join(f"{k}: {v['not_run']}" for k, v in summaries.items()))
+    if output is not None:
+        write_text(Path(output) / COMPARISON, to_json(summaries), force=force)
+    return summaries
+
+
+def known_estimators(names: Sequence[str]) -> None:
+    """Raise for a name that does not exist."""
+    from tbmfg.estimators import ESTIMATORS
+
+    for name in names:
+        if name not in ESTIMATORS:
+            raise TbmfgError(f"no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
+
+
+def unmet(name: str, prepared: Problem) -> str | None:
+    """What an estimator needs and this problem does not have, or None."""
+    from tbmfg.estimators import ESTIMATORS
+
+    have = {"imu", *(kind_of(rows.sensor) for rows in prepared.rows)}
+    missing = [kind for kind in ESTIMATORS[name].needs if kind not in have]
+    return f"needs {', '.join(missing)}" if missing else None
 
 
 def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> tuple[Rig, list[str]]:
