@@ -21,18 +21,16 @@ def run_all(function: Callable[[Job], Done], jobs: list[Job], processes: int, ti
 
     The processes are started afresh, so that the thread limits are read by whatever they load.
     """
+    pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=multiprocessing.get_context("spawn"))
     with _one_thread(), _bar(title, len(jobs)) as step:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+        try:
             futures = [pool.submit(function, job) for job in jobs]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    step()
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-            return [future.result() for future in futures]
+            for future in as_completed(futures):
+                future.result()
+                step()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [future.result() for future in futures]
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 """Benchmarks: the statistics on draws whose answer is known, the commands on tiny runs, and the gate both ways."""
 
 import json
+import os
+import time
 from argparse import Namespace
 from dataclasses import replace
 
@@ -13,6 +15,7 @@ from benchmarks import accuracy, gate, runs, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
+from benchmarks.workers import run_all
 from tbmfg.rig import dump_rig, override
 
 KEYS = ["scenario", "estimator", "metric", "unit", "mean", "sd", "n", "bound", "published"]
@@ -133,6 +136,19 @@ def test_compare_names_what_is_worse_and_what_is_gone():
     assert len(faults) == 2
     assert faults[0].startswith("s batch position: 1.2 against 1 mm")
     assert faults[1].startswith("s batch ape: missing")
+
+
+# ---- workers ----
+
+
+def test_jobs_have_one_thread_and_a_failing_one_ends_the_others(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert run_all(os.getenv, ["OMP_NUM_THREADS"] * 3, 2, "three") == ["1"] * 3
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    started = time.monotonic()
+    with pytest.raises(TypeError):
+        run_all(time.sleep, ["no number", *[0.1] * 1000], 2, "all of them would take 50 s")
+    assert time.monotonic() - started < 25.0
 
 
 # ---- commands ----
