@@ -30,13 +30,13 @@ def _triple(value: Any) -> Any:
 
 def _noise_factor(value: Any) -> float | Literal["auto"]:
     if value == "auto" or (_is_number(value) and value > 0):
-        return value
+        return value if value == "auto" else float(value)
     raise PydanticCustomError("noise_factor", "should be auto or a number greater than 0")
 
 
 def _moment(value: Any) -> float | Literal["start", "end"]:
     if value in ("start", "end") or _is_number(value):
-        return value
+        return float(value) if _is_number(value) else value
     raise PydanticCustomError("moment", "should be start, end or seconds from the first IMU sample")
 
 

@@ -60,6 +60,14 @@ def test_round_trip_is_exact_for_any_number_and_any_topic(value, topic):
     assert parse_rig(dump_rig(rig), "dump") == rig
 
 
+@pytest.mark.filterwarnings("error")
+def test_whole_numbers_round_trip_where_a_word_may_stand():
+    text = "sensors: {imu: {topic: /imu, noise_factor: 2}}\nsurvey: [{at: 3, position_m: [1, 2, 3], sigma_m: 1}]"
+    rig = parse_rig(text, "rig.yaml")
+    assert parse_rig(dump_rig(rig), "rig.yaml") == rig
+    assert (rig.imu.noise_factor, rig.survey[0].at) == (2.0, 3.0)
+
+
 def test_rig_pickles_and_is_frozen():
     rig = load_rig("tbm")
     assert pickle.loads(pickle.dumps(rig)) == rig
