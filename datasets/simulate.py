@@ -117,7 +117,7 @@ def simulate(
     *,
     seed: int,
     duration_s: float,
-    truth_rate_hz: float = 50.0,
+    truth_rate_hz: float,
 ) -> Simulation:
     """A log of every sensor of ``rig`` whose kind is in ``sensors``; the others leave the rig."""
     if rig.origin.latitude_deg is None:
