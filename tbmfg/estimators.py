@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tbmfg.errors import TbmfgError
+from tbmfg.errors import EstimationError, TbmfgError
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
@@ -116,7 +116,33 @@ ESTIMATORS: dict[str, Estimator] = {
 
 
 def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], None] | None = None) -> Result:
-    """Run the estimator called ``name``. Raises TbmfgError for a name that does not exist."""
+    """Run the estimator called ``name``. Raises TbmfgError for a name that does not exist, EstimationError where
+    the problem is hopeless."""
     if name not in ESTIMATORS:
         raise TbmfgError(f"no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
-    return ESTIMATORS[name].run(problem, lambda share: progress(name, share) if progress else None)
+    from tbmfg.problem import breakdown_explained
+
+    with breakdown_explained(name):
+        result = ESTIMATORS[name].run(problem, lambda share: progress(name, share) if progress else None)
+    _refuse_nonsense(problem, result)
+    for sensor, count in result.counts.items():
+        if count.gated > count.used:
+            result.warnings.append(
+                f"{sensor}: {count.gated} of {count.gated + count.used} samples contradict the estimate and were "
+                "gated; do not trust it before the rig's entry for this sensor is checked"
+            )
+    return result
+
+
+def _refuse_nonsense(problem: Problem, result: Result) -> None:
+    """Raise EstimationError where a result holds numbers that are none."""
+    import numpy as np
+
+    for path in (result.trajectory, result.smoothed or result.trajectory):
+        columns = (path.position_n, path.quat_xyzw, path.velocity_n, path.bias_acc, path.bias_gyro, path.cov)
+        finite = np.all([np.isfinite(column).reshape(len(path), -1).all(axis=1) for column in columns], axis=0)
+        if not finite.all():
+            raise EstimationError(
+                f"{result.estimator} lost the state at {problem.keyframes_s[np.argmin(finite)]:.1f} s: it is not "
+                "finite there; check the rig's units and priors, and the readings at that time"
+            )

@@ -155,9 +155,10 @@ def _choose_imu(log: Log, candidates: list[Series]) -> tuple[Series, list[Series
     """The IMU of the machine, and the other ones."""
     usable = [s for s in candidates if len(s) >= LEAST]
     if not usable:
-        empty = [f"{s.topic} ({s.counts.received} messages, none usable)" for s in candidates]
+        empty = [f"{s.topic} ({_losses(s)})" for s in candidates]
         unread = [f"{topic} ({type})" for topic, type in sorted(log.unknown.items()) if "Imu" in type]
         have = [f"{s.topic} ({_short(s.type)})" for _, s in sorted(log.series.items())]
+        have += [f"{topic} ({_short(type) or 'no type'}, not read)" for topic, type in sorted(log.unknown.items())]
         why = f"unusable: {', '.join(empty + unread)}" if empty or unread else f"it has {_listed(have)}"
         raise LogError(f"{log.path}: no sensor_msgs/Imu to estimate from, {why}; every estimator needs an IMU")
 
@@ -171,6 +172,14 @@ def _choose_imu(log: Log, candidates: list[Series]) -> tuple[Series, list[Series
 
     best = usable[0] if len(usable) == 1 else max(usable, key=rank)
     return best, [s for s in candidates if s is not best]
+
+
+def _losses(series: Series) -> str:
+    """How many messages there were, and why so few are left."""
+    c = series.counts
+    lost = {"hold NaN": c.nonfinite, "bear a wrong stamp": c.misdated, "cannot be decoded": c.undecodable}
+    reasons = [f"{count} {what}" for what, count in lost.items() if count]
+    return ", ".join([f"{len(series)} usable of {c.received + c.undecodable} messages", *reasons])
 
 
 def _imu(draft: _Draft, base: str | None) -> None:
@@ -201,7 +210,7 @@ def _one_of(draft: _Draft, kind: str, candidates: list[Series], fill: Callable[[
             taken = draft.sensors[kind]["topic"]
             draft.leave(series.topic, f"{taken} is the {kind}; add this as {kind}-2 if it is another one")
         elif len(series) < LEAST:
-            draft.leave(series.topic, f"{len(series)} usable of {series.counts.received} messages")
+            draft.leave(series.topic, _losses(series))
         elif (reason := _no_measurement(series) or fill(draft, series)) is not None:
             draft.leave(series.topic, reason)
 

@@ -106,7 +106,11 @@ def open_session(
     rig, assumed = rig_for(log, rig, overrides)
     dropped = dropped_sensors(rig, without, only)
     reference = find_truth(truth, log, rig)
-    prepared = prepare(log, rig, outages=tuple(outages), without=dropped, progress=progress)
+    try:
+        prepared = prepare(log, rig, outages=tuple(outages), without=dropped, progress=progress)
+    except EstimationError as error:
+        left_out = [line for line in assumed if not line.startswith("assumed")]
+        raise EstimationError("; ".join([str(error), *left_out])) from error
     options = {"outages": list(outages), "without": dropped, "set": list(overrides)}
     shared_s = time.perf_counter() - started
     return Session(log, str(log_path), prepared, reference, tuple(assumed), options, shared_s)

@@ -22,7 +22,7 @@ from tbmfg.inertial.strapdown import rotations
 from tbmfg.mcap.clouds import TYPE as CLOUDS
 from tbmfg.mcap.info import guess_role
 from tbmfg.measure import GyroFrame, Samples
-from tbmfg.problem import Inertial, Parameters, Prior, Problem
+from tbmfg.problem import Inertial, Parameters, Prior, Problem, breakdown_explained
 from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, Prism, Rig, Sensor, kind_of
 from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Log, Series, seconds
@@ -92,16 +92,17 @@ def prepare(
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
     log, rig, said = gnss.into_n(log, rig)
     warnings: list[str] = [*log.damage, *_losses(log, rig, without), *said]
-    steps, imu_counts = _imu_steps(log, rig)
+    steps, imu_counts = _imu_steps(log, rig, warnings)
     missing: list[str] = []
     samples, counts = _samples(log, rig, steps, outages, without, missing)
     if not samples and rig.motion is None:
         raise EstimationError("; ".join([f"{log.path}: {ALONE}", *missing]))
     warnings += missing
     counts = {"imu": imu_counts, **counts}
-    setup = _align(rig, steps, samples, counts, warnings)
-    offsets = {name: rig.sensors[name].clock_offset for name in samples if _is_position(rig, name)}
-    problem = _search(setup, offsets, tell)
+    with breakdown_explained("preparing the estimate"):
+        setup = _align(rig, steps, samples, counts, warnings)
+        offsets = {name: rig.sensors[name].clock_offset for name in samples if _is_position(rig, name)}
+        problem = _search(setup, offsets, tell)
     problem.intervals = [
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
@@ -115,29 +116,43 @@ def _is_position(rig: Rig, name: str) -> bool:
     return isinstance(rig.sensors[name], PositionSensor)
 
 
-def _imu_steps(log: Log, rig: Rig) -> tuple[Steps, Counts]:
-    name = next(name for name in rig.sensors if kind_of(name) == "imu")
-    series = log.series.get(rig.imu.topic)
-    if series is None or "gyro" not in series.columns:
-        have = ", ".join(sorted(t for t, s in log.series.items() if s.type.endswith("Imu"))) or "none"
-        raise LogError(
-            f"{log.path}: no Imu messages on {rig.imu.topic!r}; Imu topics in the log: {have}; set sensors.imu.topic"
-        )
-    if any(rig.imu.T_bi.xyz_m):
-        raise RigError(
-            f"sensors.{name}.T_bi.xyz_m must be zero: b has its origin at the IMU; move the other sensors' arms instead"
-        )
+def _imu_steps(log: Log, rig: Rig, warnings: list[str]) -> tuple[Steps, Counts]:
+    """Integration steps of the IMU, in SI and b axes."""
+    topic = rig.imu.topic
+    series = log.series.get(topic)
+    if series is None:
+        raise LogError(f"{log.path}: imu: {_absence(log, 'imu', topic)}; every estimator needs an IMU")
+    if "gyro" not in series.columns:
+        raise LogError(f"{log.path}: imu: {topic} is {series.type}, {_instead(log, 'imu')}; set sensors.imu.topic")
     c = series.counts
-    counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
-    if len(series) < LEAST_IMU:
-        lost = {"hold NaN": c.nonfinite, "repeat a stamp": c.duplicate, "bear a wrong stamp": c.misdated}
-        why = ", ".join(f"{count} {what}" for what, count in lost.items() if count) or "the log ends there"
-        raise LogError(f"{log.path}: {rig.imu.topic}: {len(series)} usable of {c.received} IMU samples ({why})")
     units = {"gyro": rig.imu.gyro_scale, "acc": rig.imu.acc_scale}
     series = replace(series, columns={column: scale * series[column] for column, scale in units.items()})
+    if (wrong := sanity.impossible(series)).any():
+        limits = " rad/s or ".join(f"{limit:g}" for limit in sanity.POSSIBLE.values())
+        warnings.append(f"imu: {wrong.sum()} of {len(series)} samples are beyond {limits} m/s^2; left out")
+        series = series.select(~wrong)
+    if len(series) < LEAST_IMU:
+        lost = {"hold NaN": c.nonfinite, "repeat a stamp": c.duplicate, "bear a wrong stamp": c.misdated}
+        why = ", ".join(f"{count} {what}" for what, count in lost.items() if count) or "there are no more"
+        raise LogError(f"{log.path}: {topic}: {len(series)} usable of {c.received} IMU samples ({why}); check the IMU")
+    counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
     steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
     if (fault := sanity.fault(steps)) is not None:
-        raise LogError(f"{log.path}: {rig.imu.topic}: {fault}")
+        raise LogError(f"{log.path}: {topic}: {fault}")
+    if stretches := sanity.stuck(series):
+        t = seconds(series.t_ns, steps.t0_ns)
+        first, last = max(stretches, key=lambda s: t[s[1]] - t[s[0]])
+        warnings.append(
+            f"imu: hangs on one reading: stretches: {len(stretches)}, the longest {t[last] - t[first]:.2f} s at "
+            f"{t[first]:.2f} s; nothing it says there is true"
+        )
+    if steps.gaps:
+        lengths = [end - start for start, end in steps.gaps]
+        longest = int(np.argmax(lengths))
+        warnings.append(
+            f"imu: gaps: {len(lengths)}, {sum(lengths):.3g} s together, the longest {lengths[longest]:.3g} s at "
+            f"{steps.gaps[longest][0]:.2f} s; bridged by interpolation, with its error as noise"
+        )
     return steps, counts
 
 
@@ -173,8 +188,10 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
         count.unused = int((~out & ~inside).sum())
         keep = ~out & inside
         if keep.sum() < 2:
+            apart = f"; its stamps begin {t[0]:.1f} s from the IMU's" if len(t) and not inside.any() else ""
             warnings.append(
-                f"{name}: {int(keep.sum())} of {len(t)} samples lie in the IMU span and outside outages; it is not used"
+                f"{name}: {int(keep.sum())} of {len(t)} samples lie in the IMU span and outside outages, which is "
+                f"not enough{apart}; it is not used"
             )
             count.unused += int(keep.sum())
             continue

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from tbmfg.errors import EstimationError
 from tbmfg.inertial.steps import Steps, to_ns
 from tbmfg.rig import Rig
 from tbmfg.sensors import Rows
@@ -125,3 +128,16 @@ class Problem:
     def size(self) -> int:
         """Dimension of one keyframe's error state."""
         return NAV + len(self.drift_walk)
+
+
+@contextmanager
+def breakdown_explained(what: str) -> Iterator[None]:
+    """Turn a numerical breakdown of ``what``, in numpy or in GTSAM, into an EstimationError."""
+    try:
+        yield
+    except (ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise EstimationError(
+            f"{what} broke down ({reason}): the readings and the rig contradict each other; check units, topics and "
+            "priors, and find the sensor with --without"
+        ) from error

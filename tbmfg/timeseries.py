@@ -67,6 +67,7 @@ class Clouds(Protocol):
     topic: str
     t_ns: Times
     frame_id: str
+    counts: StreamCounts
 
     def __len__(self) -> int: ...
 

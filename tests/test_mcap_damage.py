@@ -228,7 +228,7 @@ def test_a_damaged_attachment_is_left_out(tmp_path, written):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"", "not an MCAP file .0 bytes"),
+        (b"", "is empty .0 bytes"),
         (b"hello", "not an MCAP file .5 bytes, beginning with b'hello'; record with: ros2 bag record -s mcap"),
         (b"SQLite format 3\0" + bytes(100), "a rosbag2 database; convert it with: ros2 bag convert"),
         (b"#ROSBAG V2.0\n", "a ROS 1 bag; convert it with: mcap convert"),

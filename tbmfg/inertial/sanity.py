@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tbmfg.inertial.steps import Steps
 from tbmfg.inertial.strapdown import rotations
-from tbmfg.timeseries import Floats
+from tbmfg.timeseries import Floats, Series
 
 IN_G = (0.8, 1.2)  # typical specific force on Earth that was never multiplied by gravity
 ON_EARTH = (5.0, 30.0)  # m/s^2: with vibration; below it gravity is missing, above it the unit is another
+CALM_S = 0.2  # specific force is judged on means over this time, so that vibration does not count
 WINDOW_S, EDGE_S = 10.0, 1.0  # gravity is followed over this time, and is a mean over that at either end
 ASTRAY = np.deg2rad(30.0)  # gravity is not where the gyro says
 BETTER = 3.0  # times smaller must the angle be in another unit
+POSSIBLE = {"gyro": 200.0, "acc": 1e4}  # rad/s, m/s^2: no IMU measures more; a reading beyond is a broken message
+STUCK = 10  # samples in a row that are equal in all six axes
 
 
 def fault(steps: Steps) -> str | None:
@@ -21,7 +25,9 @@ def fault(steps: Steps) -> str | None:
         if not np.ptp(values, axis=0).any():
             same = " ".join(f"{x:.4g}" for x in values[0])
             return f"all samples of the {what} read {same}: it is stuck; check the sensor and its driver"
-    typical = float(np.median(np.linalg.norm(steps.acc, axis=1)))
+    size = max(1, min(round(CALM_S / steps.period_s), len(steps)))
+    calm = _means(steps.acc, np.arange(0, len(steps) - size + 1, size), size)
+    typical = float(np.median(np.linalg.norm(calm, axis=1)))
     if IN_G[0] < typical < IN_G[1]:
         return (
             f"specific force is typically {typical:.3g} m/s^2 where gravity alone is 9.8: it seems to be in g; if so, "
@@ -40,6 +46,23 @@ def fault(steps: Steps) -> str | None:
             f"{np.rad2deg(along):.0f} deg if it is in deg/s; if so, set sensors.imu.gyro_unit=deg/s"
         )
     return None
+
+
+def impossible(imu: Series) -> NDArray[np.bool_]:
+    """Samples that no IMU can have measured, (n,). None where most are so: then the unit is wrong, not the samples."""
+    wrong = np.zeros(len(imu), dtype=bool)
+    for column, limit in POSSIBLE.items():
+        wrong |= np.abs(imu[column]).max(axis=1) > limit
+    return wrong & (np.mean(wrong) < 0.5)
+
+
+def stuck(imu: Series) -> list[tuple[int, int]]:
+    """Stretches (first, last row) in which the samples repeat exactly: the sensor hung."""
+    same = np.ones(len(imu) - 1, dtype=bool)
+    for column in POSSIBLE:
+        same &= (np.diff(imu[column], axis=0) == 0).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STUCK]
 
 
 def gravity_astray(steps: Steps, scale: float) -> float:

@@ -70,6 +70,8 @@ class McapFile:
             raise LogError(f"{path}: cannot be read ({error.strerror}); check the name and its permissions") from None
         if not start.startswith(MAGIC):
             self._file.close()
+            if not start:
+                raise LogError(f"{path}: is empty (0 bytes): the recorder wrote nothing; record again")
             kind = next((text for magic, text in _FOREIGN.items() if start.startswith(magic)), None)
             detail = kind or f"{self.size} bytes, beginning with {start[:8]!r}; record with: ros2 bag record -s mcap"
             raise LogError(f"{path}: not an MCAP file ({detail})")

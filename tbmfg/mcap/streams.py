@@ -186,7 +186,8 @@ def _in_time_order(
 
 
 def _finite_rows(values: Floats) -> NDArray[np.bool_]:
-    return np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    finite = np.isfinite(values)
+    return finite if finite.ndim == 1 else finite.all(axis=1)
 
 
 def _filled(layout: Layout, columns: dict[str, Floats]) -> dict[str, Floats]:
