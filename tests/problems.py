@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import datasets
 from datasets import sensors
@@ -13,7 +14,7 @@ from datasets.motion import Lines, Motion, Spline
 from datasets.simulate import Simulation, simulate
 from tbmfg.prepare import prepare
 from tbmfg.problem import Problem
-from tbmfg.rig import override, parse_rig
+from tbmfg.rig import Rig, override, parse_rig
 from tbmfg.timeseries import Floats, Log, Series, StreamCounts
 
 EPS = np.finfo(float).eps
@@ -75,7 +76,8 @@ def flight(
         "magnetometer": lambda *a: sensors.magnetometer(*a, rate_hz=20.0),
     }
     rig = override(parse_rig(FLIGHT_RIG, "flight"), settings)
-    return simulate("flight", flight_path(stand_s, duration), rig, kinds, seed=seed, duration_s=duration)
+    path = flight_path(stand_s, duration)
+    return simulate("flight", path, rig, kinds, seed=seed, duration_s=duration, truth_rate_hz=50.0)
 
 
 @cache
@@ -151,3 +153,20 @@ def axes(*names: str) -> list[str]:
 
 
 ERRORS = axes("rot", "pos", "vel", "acc bias", "gyro bias")
+
+
+def true_rig(simulation: Simulation) -> Rig:
+    """The simulation's rig with every prior mean at the truth; the sds stay."""
+    start, rig, drawn = simulation.truth(np.zeros(1)), simulation.rig, simulation.drawn
+    yaw, pitch, roll = np.degrees(Rotation.from_matrix(start.R[0]).as_euler("ZYX"))
+    settings = [
+        f"initial.yaw_deg={yaw}",
+        f"initial.pitch_deg={pitch}",
+        f"initial.roll_deg={roll}",
+        f"initial.position_m={start.position[0].tolist()}",
+        f"initial.velocity_mps={start.velocity[0].tolist()}",
+        f"sensors.prism.arm_m={drawn['prism']['arm_m'].tolist()}",
+        "sensors.prism.clock_offset_s=0",
+        f"sensors.magnetometer.declination_deg={drawn['magnetometer']['declination_deg']}",
+    ]
+    return override(rig, settings)
