@@ -24,7 +24,7 @@ from tbmfg.mcap.info import guess_role
 from tbmfg.measure import GyroFrame, Samples
 from tbmfg.problem import Inertial, Parameters, Prior, Problem, breakdown_explained
 from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, Prism, Rig, Sensor, kind_of
-from tbmfg.state import NAV, Calibrated, Counts, Interval
+from tbmfg.state import BG, NAV, ROT, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Log, Series, seconds
 
 Prepared = Problem
@@ -42,6 +42,8 @@ ALONE = (
 )
 LEAST_IMU = 3
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
+GYROCOMPASS = np.deg2rad(15.0)  # a gyro whose bias leaves a larger doubt than this cannot find north
+GYROCOMPASS_SLACK = np.deg2rad(0.1)  # of the coarse heading beside the bias: noise and motion of the still stretch
 FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
 SCALE_PRIOR_LOG2 = 0.7  # sd of log2 of the noise against the spectrum's floor, for logs that hardly say
 
@@ -59,6 +61,7 @@ class _Setup:
     parameters: Parameters
     R_start: Floats
     yaw_sd: float
+    gyrocompassed: bool
     still: list[tuple[float, float]]
     still_sigma: Floats
     bias_gyro: Floats
@@ -276,11 +279,18 @@ def _align(
     start = rig.initial
     R_level = _with_given_tilt(R_level, start.roll, start.pitch)
     position = next((s for name, s in samples.items() if _is_position(rig, name)), None)
-    R_start, yaw_sd = R_level, start.yaw_sd
+    bound = alignment.gyrocompass_bound(rig.imu.gyro_bias_sd, rig.origin.rate_n)
+    R_start, yaw_sd, gyrocompassed = R_level, start.yaw_sd, False
     if start.yaw is not None:
         R_start = rotation_z(start.yaw - float(yaw_of(R_level))) @ R_level
     elif (found := _magnetic_heading(rig, samples, frame, R_level)) is not None:
         R_start, yaw_sd = rotation_z(found) @ R_level, min(yaw_sd, np.deg2rad(10.0))
+    elif still and bound < GYROCOMPASS:
+        turn = alignment.gyrocompass(steps, R_0t, still, R_level, rig.origin.rate_n)
+        R_start, yaw_sd, gyrocompassed = rotation_z(turn) @ R_level, bound, True
+        warnings.append(
+            f"heading by gyrocompass: at first no better than bias / (w cos lat) = {np.rad2deg(bound):.2g} deg (1 sd)"
+        )
     elif position is not None:
         sensor = rig.sensors[position.sensor]
         spread = 3.0 * sensor.clock_offset_sd
@@ -301,7 +311,7 @@ def _align(
     sigma = np.hypot(rig.zero_velocity.sigma, _vibration_speed(steps, confirmed))
     origin_n = np.round(np.median(position.values[:50], axis=0)) if position is not None else np.zeros(3)
     return _Setup(
-        rig, steps, frame, gyro, acc, samples, _parameters(rig, samples), R_start, yaw_sd, confirmed,
+        rig, steps, frame, gyro, acc, samples, _parameters(rig, samples), R_start, yaw_sd, gyrocompassed, confirmed,
         np.full(3, sigma), bias_gyro, origin_n, counts, warnings,
     )  # fmt: skip
 
@@ -465,7 +475,15 @@ def _prior(setup: _Setup, x: Floats, drift_sd: Floats, has_fixes: bool) -> Prior
         cov[3:, 3:] = np.diag(np.concatenate([sd, drift_sd]) ** 2)
         return cov
 
-    return Prior(x, covariance(start.yaw_sd), covariance(setup.yaw_sd))
+    filter_cov = covariance(setup.yaw_sd)
+    if setup.gyrocompassed:
+        # the heading was found with the gyro, so its error is the bias's: d_rot = -up_b (east_b . d_bg) / w_north
+        earth_n = rig.origin.rate_n
+        east_b = R.T @ np.cross(earth_n, [0.0, 0.0, 1.0]) / np.linalg.norm(earth_n[:2]) ** 2
+        cross = -np.outer(R[2], east_b) * rig.imu.gyro_bias_sd**2
+        filter_cov[ROT, BG], filter_cov[BG, ROT] = cross, cross.T
+        filter_cov[ROT, ROT] += np.outer(R[2], R[2]) * GYROCOMPASS_SLACK**2
+    return Prior(x, covariance(start.yaw_sd), filter_cov)
 
 
 def _search(setup: _Setup, offsets: dict[str, float], tell: Callable[[str, float], None]) -> Problem:

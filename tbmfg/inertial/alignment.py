@@ -55,6 +55,21 @@ def level_at_start(steps: Steps, R_0t: Floats, still: list[tuple[float, float]],
     return level(np.einsum("tij,tj->ti", R_0t[:-1][rows], steps.acc[rows]).mean(axis=0))
 
 
+def gyrocompass(
+    steps: Steps, R_0t: Floats, still: list[tuple[float, float]], R_level: Floats, earth_n: Floats
+) -> float:
+    """Turn about the vertical [rad] from the levelled start frame to n: still, it feels Earth's rate only."""
+    rows = rows_between(steps, *max(still, key=lambda s: s[1] - s[0]))
+    felt = R_level @ R_0t[rows.start] @ steps.gyro[rows].mean(axis=0)
+    return float(np.arctan2(earth_n[1], earth_n[0]) - np.arctan2(felt[1], felt[0]))
+
+
+def gyrocompass_bound(gyro_bias_sd: float, earth_n: Floats) -> float:
+    """Least sd of a gyrocompass heading [rad]: bias / (w_ie cos latitude); infinite where no Earth rate is modelled."""
+    north = float(np.linalg.norm(earth_n[:2]))
+    return gyro_bias_sd / north if north > 0 else np.inf
+
+
 @dataclass(frozen=True, slots=True)
 class MotionFit:
     """Heading (angle from the levelled start frame to n about the vertical, rad), its sd, and the clock offset [s]."""
