@@ -88,8 +88,8 @@ def odometer(z, data, xi, xj, c):
     B = sum R_i^T R(t) E e_x v (t - t_i) dt, the gyro bias b_0 that both were computed with, and D~, which is D with
     the speed smoothed over seconds. c (3): scale s, mounting yaw and pitch [rad], E = Rz(yaw) Ry(pitch).
     h = E^T (u - [B]x (b_g - b_0)) + s / (1 + s) D~, u = R_i^T (p_j + R_j l - p_i) - l; no sliding sideways, no
-    lifting. Multiplied onto u or D instead, the body's vibration or the odometer's noise would pass for scale (errors in
-    variables); D~ holds next to nothing of either.
+    lifting. Multiplied onto u or D instead, the body's vibration or the odometer's noise would pass for scale
+    (errors in variables); D~ holds next to nothing of either.
     """
     n, d = len(z), xi.shape[1] - 6
     r, Ji, Jj, Jc = np.empty((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, d)), np.zeros((n, 3, 3))
@@ -191,8 +191,8 @@ MODELS: dict[str, Callable] = {f.__name__: f for f in (prism, odometer, magnetom
 class Rows:
     """Measurements of one sensor: row r links keyframes ``i[r]`` and ``j[r]`` (equal for one time), i in order.
 
-    ``z`` (n, .), ``data`` (n, .) as the model wants them; ``sigma`` (n, k); ``calib`` where the sensor's calibrations lie
-    in the calibration vector; ``samples`` (n,) messages behind each row; ``loss`` none, huber or cauchy.
+    ``z`` (n, .), ``data`` (n, .) as the model wants them; ``sigma`` (n, k); ``calib`` where the sensor's calibrations
+    lie in the calibration vector; ``samples`` (n,) messages behind each row; ``loss`` none, huber or cauchy.
     """
 
     sensor: str
