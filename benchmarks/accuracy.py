@@ -6,7 +6,8 @@ once and given to each estimator. Per scenario and estimator, over the seeds:
 position .. velocity   RMS errors over the keyframes; ``ape`` after rigid alignment. ``position`` is that of the body
                        and holds the part of the lever arm that the log cannot tell; its bound is the position
                        sensor's own noise, sqrt(3) sd
-prism_point            the same at the tracked point, position + R arm with the estimated arm; same bound
+position_sd            what the covariance says of ``position``, RMS
+prism_point            RMS error of the tracked point, position + R arm with the estimated arm; bound as of ``position``
 nees_pose@T            squared error of the 6-dof pose over its covariance at T s, divided by 6. The runs are
                        independent, so its mean lies in chi-square bounds; all such cells of the command together
                        leave theirs by chance in 1 % of the commands

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tbmfg.errors import TbmfgError
+from tbmfg.state import POS
 from tbmfg.timeseries import Floats, Log, StreamCounts
 
 if TYPE_CHECKING:
@@ -98,6 +99,8 @@ def measure(job: Job, simulation: Simulation, problem: Problem, result: Result) 
     truth = true_states(simulation, path.t_ns)
     found = evaluate(path, truth)
     metrics = {(name, unit): factor * found[key] for key, (name, unit, factor) in ERRORS.items()}
+    said = np.trace(path.cov[:, POS, POS], axis1=1, axis2=2)
+    metrics["position_sd", "mm"] = 1e3 * float(np.sqrt(np.mean(said)))
     limits = {}
     for name, (rms, noise) in point_errors(simulation, problem, result, truth).items():
         metrics[f"{name}_point", "mm"] = 1e3 * rms
