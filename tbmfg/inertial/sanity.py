@@ -53,7 +53,7 @@ def impossible(imu: Series) -> NDArray[np.bool_]:
     wrong = np.zeros(len(imu), dtype=bool)
     for column, limit in POSSIBLE.items():
         wrong |= np.abs(imu[column]).max(axis=1) > limit
-    return wrong & (np.mean(wrong) < 0.5)
+    return wrong & (2 * wrong.sum() < len(wrong))
 
 
 def stuck(imu: Series) -> list[tuple[int, int]]:

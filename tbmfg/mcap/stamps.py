@@ -48,12 +48,19 @@ def _unset(t_ns: Times) -> NDArray[np.bool_]:
 
 
 def _rerun(t_ns: Times) -> NDArray[np.bool_]:
-    """Of stamps in the order they came: those that lie far before an earlier one, or those far after a later
+    """Of stamps in the order they came: the stretches far behind an earlier one, or those far ahead of a later
     one, whichever are fewer. Nothing where the two do not overlap: there only the order was lost."""
     if len(t_ns) < 2:
         return np.zeros(len(t_ns), dtype=bool)
-    behind = np.maximum.accumulate(t_ns) - t_ns > _RERUN
+    behind = _far(np.maximum.accumulate(t_ns) - t_ns)
     if not behind.any() or t_ns[behind].max() < t_ns[~behind].min():
         return np.zeros_like(behind)
-    ahead = t_ns - np.minimum.accumulate(t_ns[::-1])[::-1] > _RERUN
+    ahead = _far(t_ns - np.minimum.accumulate(t_ns[::-1])[::-1])
     return ahead if ahead.sum() < behind.sum() else behind
+
+
+def _far(excess: Times) -> NDArray[np.bool_]:
+    """Stretches of positive ``excess`` that reach beyond what messages overtake each other by."""
+    inside = excess > 0
+    stretch = np.cumsum(np.diff(inside, prepend=False))
+    return inside & np.isin(stretch, np.unique(stretch[excess > _RERUN]))
