@@ -1,14 +1,13 @@
-"""``python -m datasets``: list the datasets, make one."""
+"""``python -m datasets``: list the datasets, make one, import one."""
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import sys
 from pathlib import Path
 from typing import Any
 
-from datasets import MACHINES, defaults, make
+from datasets import MACHINES, RECORDINGS, defaults, load, make, module_of
 from tbmfg.errors import TbmfgError
 
 
@@ -22,24 +21,32 @@ def main(arguments: list[str] | None = None) -> int:
     maker.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .mcap to write")
     maker.add_argument("--seed", type=int, default=0, help="of every draw (default 0)")
     maker.add_argument("--duration", type=float, default=120.0, metavar="S", help="seconds (default 120)")
-    maker.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="assignments",
-        help="an option of the dataset, or with dots a value of its rig: sensors.prism.sigma_mm=2",
-    )
+    importer = commands.add_parser("import", help="write a public recording as MCAP, a rig attached")
+    importer.add_argument("name", metavar="NAME", help="as in the list")
+    importer.add_argument("source", type=Path, metavar="SRC", help="its npz, or the folder that holds it")
+    importer.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .mcap to write")
+    for command in (maker, importer):
+        command.add_argument(
+            "--set",
+            action="append",
+            default=[],
+            metavar="KEY=VALUE",
+            dest="assignments",
+            help="an option of the dataset, or with dots a value of its rig: sensors.prism.sigma_mm=2",
+        )
     given = parser.parse_args(arguments)
     try:
         if given.command == "list":
-            print("\n".join(describe(name) for name in MACHINES))
+            print("\n".join(describe(name) for name in (*MACHINES, *RECORDINGS)))
+            return 0
+        settings, options = sort(given.name, given.assignments)
+        if given.command == "make":
+            log = make(given.name, seed=given.seed, duration=given.duration, settings=settings, **options)
         else:
-            settings, options = sort(given.name, given.assignments)
-            simulation = make(given.name, seed=given.seed, duration=given.duration, settings=settings, **options)
-            simulation.write(given.output)
-            counts = ", ".join(f"{series.topic} {len(series)}" for series in simulation.log_series)
-            print(f"{given.output}: {counts}")
+            log = load(given.name, given.source, settings=settings, **options)
+        log.write(given.output)
+        counts = ", ".join(f"{series.topic} {len(series)}" for series in log.log_series)
+        print(f"{given.output}: {counts}")
     except (TbmfgError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -48,24 +55,41 @@ def main(arguments: list[str] | None = None) -> int:
 
 def describe(name: str) -> str:
     """One dataset in two lines: what it is, and its options."""
-    summary = (importlib.import_module(MACHINES[name]).__doc__ or "").partition("\n")[0]
-    return f"{name}  {summary}\n    " + " ".join(f"{key}={value}" for key, value in defaults(name).items())
+    summary = (module_of(name).__doc__ or "").partition("\n")[0]
+    kind = "make" if name in MACHINES else "import"
+    options = " ".join(f"{key}={_written(value)}" for key, value in defaults(name).items())
+    return f"{kind} {name}  {summary}" + f"\n    {options}" * bool(options)
 
 
 def sort(name: str, assignments: list[str]) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Assignments to the rig (their key has dots), and the dataset's own options as numbers."""
+    """Assignments to the rig (their key has dots), and the dataset's own options in the types of their defaults."""
     settings = tuple(text for text in assignments if "." in text.partition("=")[0])
     options: dict[str, Any] = {}
-    known = defaults(name) if name in MACHINES else {}
+    known = defaults(name) if name in MACHINES or name in RECORDINGS else {}
     for text in assignments:
         key, _, value = text.partition("=")
         if "." in key:
             continue
         try:
-            options[key] = type(known.get(key, ""))(value)
+            options[key] = _read(value, known.get(key, ""))
         except ValueError:
-            raise TbmfgError(f"--set {text}: {key} should be a number such as {known[key]}") from None
+            what = "numbers" if isinstance(known[key], tuple) else "a number"
+            raise TbmfgError(f"--set {text}: {key} should be {what} such as {_written(known[key])}") from None
     return settings, options
+
+
+def _read(text: str, default: Any) -> Any:
+    """``text`` as what ``default`` is: text, a number, or as many numbers between commas."""
+    if not isinstance(default, tuple):
+        return type(default)(text)
+    values = tuple(float(part) for part in text.split(","))
+    if len(values) != len(default):
+        raise ValueError
+    return values
+
+
+def _written(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 if __name__ == "__main__":
