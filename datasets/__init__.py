@@ -8,7 +8,7 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``motion``    truth as a function of time, with exact derivatives
 - ``simulate``  the place on Earth, means over sampling periods, the rig whose priors everything is drawn from
 - ``sensors``   ideal sensors on a motion, and their noise
-- ``tbm``       a machine: how it moves, how it shakes, what it carries
+- ``tbm``       a machine: how it moves, how it shakes, what it carries; ``tbm_static``: the same standing still
 - ``recordings``  what was really measured, from the npz it is packaged in
 """
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 # Each module has ``rig()``, the rig whose priors it draws from, and ``make(rig, *, seed, duration, **options)``.
 MACHINES = {
     "tbm-drive": "datasets.tbm",
+    "tbm-static": "datasets.tbm_static",
 }
 
 # Each module has ``load(source, **options)``.

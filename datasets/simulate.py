@@ -141,14 +141,15 @@ def draw_prior(rig: Rig, start: Kinematics, rng: np.random.Generator) -> dict[st
     """Values for the rig's ``initial``: the true start plus errors drawn from its standard deviations.
 
     The attitude error is a rotation vector e about n's axes, R_rig = Exp(e) R_true: x and y have
-    ``tilt_sd_deg``, z has ``yaw_sd_deg``.
+    ``tilt_sd_deg``, z has ``yaw_sd_deg``. A heading that the rig does not know (180 degrees) stays unknown.
     """
     prior = rig.initial
     turn, shift, speed = rng.standard_normal((3, 3))
     error_n = np.radians([prior.tilt_sd_deg, prior.tilt_sd_deg, prior.yaw_sd_deg]) * turn
     R = Rotation.from_rotvec(error_n).as_matrix() @ start.R[0]
+    yaw_deg = float(np.degrees(np.arctan2(R[1, 0], R[0, 0])))
     return {
-        "yaw_deg": float(np.degrees(np.arctan2(R[1, 0], R[0, 0]))),
+        "yaw_deg": yaw_deg if prior.yaw_sd_deg < 180.0 else None,
         "pitch_deg": float(np.degrees(-np.arcsin(R[2, 0]))),
         "roll_deg": float(np.degrees(np.arctan2(R[2, 1], R[2, 2]))),
         "position_m": tuple((start.position[0] + prior.position_sd_m * shift).tolist()),

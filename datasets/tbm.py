@@ -131,6 +131,12 @@ class Plan:
     pump: Floats
 
     @staticmethod
+    def standing(duration_s: float) -> Plan:
+        """Nothing moves and nothing runs."""
+        t_s = np.arange(-1.0, duration_s + 1.0 + STEP_S, STEP_S)
+        return Plan(t_s, *np.zeros((4, len(t_s))))
+
+    @staticmethod
     def over(duration_s: float) -> Plan:
         """Standing, then rounds; from a second before the log to a second after it."""
         t_s = np.arange(-1.0, duration_s + 1.0 + STEP_S, STEP_S)
