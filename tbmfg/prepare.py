@@ -95,7 +95,7 @@ def prepare(
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
     log, rig, said = gnss.into_n(log, rig)
     warnings: list[str] = [*log.damage, *_losses(log, rig, without), *said]
-    steps, imu_counts = _imu_steps(log, rig, warnings)
+    steps, imu_counts = _imu_steps(log, rig, outages, warnings)
     missing: list[str] = []
     samples, counts = _samples(log, rig, steps, outages, without, missing)
     if not samples and rig.motion is None:
@@ -119,7 +119,9 @@ def _is_position(rig: Rig, name: str) -> bool:
     return isinstance(rig.sensors[name], PositionSensor)
 
 
-def _imu_steps(log: Log, rig: Rig, warnings: list[str]) -> tuple[Steps, Counts]:
+def _imu_steps(
+    log: Log, rig: Rig, outages: tuple[tuple[str, float, float], ...], warnings: list[str]
+) -> tuple[Steps, Counts]:
     """Integration steps of the IMU, in SI and b axes."""
     topic = rig.imu.topic
     series = log.series.get(topic)
@@ -134,11 +136,19 @@ def _imu_steps(log: Log, rig: Rig, warnings: list[str]) -> tuple[Steps, Counts]:
         limits = " rad/s or ".join(f"{limit:g}" for limit in sanity.POSSIBLE.values())
         warnings.append(f"imu: {wrong.sum()} of {len(series)} samples are beyond {limits} m/s^2; left out")
         series = series.select(~wrong)
+    hidden = _hidden("imu", seconds(series.t_ns, series.t_ns[0] if len(series) else 0), outages)
+    series = series.select(~hidden)
     if len(series) < LEAST_IMU:
         lost = {"hold NaN": c.nonfinite, "repeat a stamp": c.duplicate, "bear a wrong stamp": c.misdated}
         why = ", ".join(f"{count} {what}" for what, count in lost.items() if count) or "there are no more"
         raise LogError(f"{log.path}: {topic}: {len(series)} usable of {c.received} IMU samples ({why}); check the IMU")
-    counts = Counts(received=c.received, used=len(series), duplicate=c.duplicate, nonfinite=c.nonfinite)
+    counts = Counts(
+        received=c.received,
+        used=len(series),
+        duplicate=c.duplicate,
+        nonfinite=c.nonfinite,
+        outage=int(hidden.sum()),
+    )
     steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
     if (fault := sanity.fault(steps)) is not None:
         raise LogError(f"{log.path}: {topic}: {fault}")
@@ -181,10 +191,7 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
             count.unused = len(series)
             continue
         t = seconds(series.t_ns, steps.t0_ns)
-        out = np.zeros(len(t), dtype=bool)
-        for sensor_name, start, end in outages:
-            if sensor_name == name:
-                out |= (t >= start) & (t < end)
+        out = _hidden(name, t, outages)
         offset, spread = getattr(sensor, "clock_offset", 0.0), 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
         inside = (t - offset - spread >= steps.edges_s[0]) & (t - offset + spread <= steps.end_s)
         count.outage = int(out.sum())
@@ -204,6 +211,15 @@ def _samples(log, rig, steps, outages, without, warnings) -> tuple[dict[str, Sam
             raise LogError(f"{log.path}: {name}: {sensor.topic} is {series.type}, {_instead(log, kind)}") from None
         samples[name] = Samples(name, t, values, _sigma(sensor, series)).select(keep)
     return samples, counts
+
+
+def _hidden(name: str, t_s: Floats, outages: tuple[tuple[str, float, float], ...]) -> np.ndarray:
+    """Which samples of the sensor ``name`` lie in an outage of its own, (n,) bool."""
+    out = np.zeros(len(t_s), dtype=bool)
+    for sensor, start, end in outages:
+        if sensor == name:
+            out |= (t_s >= start) & (t_s < end)
+    return out
 
 
 def _losses(log: Log, rig: Rig, without: tuple[str, ...]) -> list[str]:
