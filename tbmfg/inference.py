@@ -13,6 +13,7 @@ import numpy as np
 from tbmfg.errors import LogError
 from tbmfg.fields import Node
 from tbmfg.geometry import matrix_from_quat, rpy_from_rotation
+from tbmfg.gnss import stated_sigma
 from tbmfg.inertial import sanity
 from tbmfg.inertial.steps import make_steps
 from tbmfg.mcap.info import guess_role, unit_problems
@@ -27,6 +28,7 @@ SIDEWAYS = 0.3  # share of the forward speed that an odometer may show sideways 
 CLEAR = 0.3  # correlation of speed and specific force from which the forward axis is told by it
 UPRIGHT = np.cos(np.deg2rad(45.0))
 ANTENNA_ARM_SD_M, PRISM_ARM_SD_M, DRAWN_SD_M = 1.0, 0.5, 0.02  # unknown on a vehicle; and as a drawing states it
+COARSE_M = 0.1  # fixes worse than this wander for minutes, and would be taken for an arm or a clock offset
 ARRIVAL_SD_S = 0.1  # two clocks without a common trigger, or a message that took its time
 DECLINATION_SD_DEG = 10.0  # on most of the Earth
 SCALE_SD = 0.02  # wear, slip, pressure
@@ -251,16 +253,17 @@ def _gnss(draft: _Draft, series: Series) -> str | None:
         return f"none of {len(series)} messages holds a fix"
     drawn = _bare(series.frame_id) != _bare(draft.imu.frame_id)  # a combined unit gives its own frame to both
     arm = draft.arm(series.frame_id) if drawn else None
-    draft.sensors["gnss"] = {
-        "topic": series.topic,
-        "arm_m": arm or [0.0, 0.0, 0.0],
-        "arm_sd_m": DRAWN_SD_M if arm else ANTENNA_ARM_SD_M,
-        "clock_offset_sd_s": ARRIVAL_SD_S,
-    }
-    draft.say("sensors.gnss.topic", f"{_short(series.type)}, {_rate(series)}, antenna positions")
-    where = f"/tf_static: at {series.frame_id}" if arm else "not in the log: estimated"
-    draft.say("sensors.gnss.arm_m", where)
-    draft.say("sensors.gnss.clock_offset_sd_s", "many receivers' fixes are stamped on arrival: estimated")
+    sigma = float(np.median(stated_sigma(series.select(_with_fix(series)), 0.0)[0]))
+    draft.say("sensors.gnss.topic", f"{_short(series.type)}, {_rate(series)}, typically good to {sigma:.2g} m")
+    sensor: dict = {"topic": series.topic, "arm_m": arm or [0.0, 0.0, 0.0]}
+    if arm:
+        draft.say("sensors.gnss.arm_m", f"/tf_static: at {series.frame_id}")
+    else:
+        draft.say("sensors.gnss.arm_m", "not in the log: " + ("at the IMU" if sigma > COARSE_M else "estimated"))
+    if sigma <= COARSE_M:
+        sensor |= {"arm_sd_m": DRAWN_SD_M if arm else ANTENNA_ARM_SD_M, "clock_offset_sd_s": ARRIVAL_SD_S}
+        draft.say("sensors.gnss.clock_offset_sd_s", "many receivers' fixes are stamped on arrival: estimated")
+    draft.sensors["gnss"] = sensor
     return None
 
 

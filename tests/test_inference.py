@@ -55,10 +55,11 @@ def points(topic="/prism", n=100):
     return Series(topic, "geometry_msgs/msg/PointStamped", stamps(5.0)[:n], columns, "station", counts=counts)
 
 
-def fixes(status=0.0, latitude=47.0):
+def fixes(status=0.0, latitude=47.0, sigma=0.02):
     t_ns = stamps(2.0)
     llh = np.tile([latitude, 8.0, 400.0], (len(t_ns), 1))
-    columns = {"llh": llh, "cov": np.ones((len(t_ns), 9)), "status": np.full(len(t_ns), status)}
+    cov = np.tile(sigma**2 * np.eye(3).ravel(), (len(t_ns), 1))
+    columns = {"llh": llh, "cov": cov, "cov_type": np.full(len(t_ns), 2.0), "status": np.full(len(t_ns), status)}
     return Series("/fix", "sensor_msgs/msg/NavSatFix", t_ns, columns, "antenna")
 
 
@@ -106,6 +107,13 @@ def test_latitude_and_antenna_by_satellite():
     inferred = infer(log_of(imu(), fixes()))
     assert inferred.rig.sensors["gnss"].topic == "/fix"
     assert inferred.rig.origin.latitude_deg == pytest.approx(47.0)
+
+
+def test_coarse_fixes_calibrate_nothing():
+    fine, coarse = (infer(log_of(imu(), fixes(sigma=sigma))).rig.sensors["gnss"] for sigma in (0.02, 2.0))
+    assert fine.arm_sd_m > 0
+    assert fine.clock_offset_sd_s > 0
+    assert coarse.arm_sd_m == coarse.clock_offset_sd_s == 0.0
 
 
 def test_without_a_fix_there_is_no_gnss():
