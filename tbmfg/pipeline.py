@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from tbmfg import __version__
 from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.results import (
@@ -247,15 +249,22 @@ def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -
 
 
 def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Calibrated]) -> Truth:
-    """What :func:`find_truth` found. The rig's own truth is brought to the IMU's clock, and has the rig's arm."""
+    """What :func:`find_truth` found. The rig's own truth gets its arm, and is brought to the IMU's clock.
+
+    Both are as the estimator found them where a sensor sees the same point: what is compared is then where that
+    sensor would have seen it.
+    """
     truth = load_truth(reference, log)
     if rig.truth is None or reference != rig.truth.topic:
         return truth
-    offset_s = 0.0
-    if clock := rig.truth.clock:
-        found = calibration.get(f"{clock}_clock_offset_s")
-        offset_s = rig.sensors[clock].clock_offset if found is None else found.value
-    return replace(truth, t_ns=truth.t_ns - round(offset_s * NS), arm_b=rig.truth.arm)
+    name = rig.truth.sensor
+    if name is None:
+        return replace(truth, arm_b=rig.truth.arm)
+    offset_s, arm_b = rig.sensors[name].clock_offset, rig.sensors[name].arm
+    if f"{name}_clock_offset_s" in calibration:  # else the sensor was left out
+        offset_s = calibration[f"{name}_clock_offset_s"].value
+        arm_b = np.array(calibration[f"{name}_lever_arm_m"].value)
+    return replace(truth, t_ns=truth.t_ns - round(offset_s * NS), arm_b=arm_b)
 
 
 def peak_rss_mb() -> float | None:

@@ -353,8 +353,8 @@ class TruthTopic(Node):
 
     topic: Text = Field(description="Odometry or PoseStamped topic.")
     arm_m: Triple = Field(ZERO, description="From the IMU to the point whose positions they are, in b.")
-    clock: Text | None = Field(
-        None, description="Sensor that shares their clock: its offset, as found, is removed; null: the IMU's clock."
+    sensor: Text | None = Field(
+        None, description="Sensor of the same point on the same clock: its arm and offset count, as found."
     )
 
     arm = si("arm_m")
@@ -448,10 +448,13 @@ class Rig(Node):
                 faults.append(fault(("sensors", name, "topic"), f"{sensor.topic} is already the topic of {other}"))
         if self.origin.longitude_deg is not None and self.origin.latitude_deg is None:
             faults.append(fault(("origin", "longitude_deg"), "should come with latitude_deg"))
-        clock = self.truth and self.truth.clock
-        if clock and not hasattr(self.sensors.get(clock), "clock_offset_s"):
-            timed = ", ".join(name for name, sensor in self.sensors.items() if hasattr(sensor, "clock_offset_s"))
-            faults.append(fault(("truth", "clock"), f"should be a sensor with a clock offset ({timed or 'none here'})"))
+        if self.truth is not None and self.truth.sensor is not None:
+            seen = [name for name, sensor in self.sensors.items() if isinstance(sensor, PositionSensor)]
+            if self.truth.sensor not in seen:
+                reason = f"should be a sensor of positions ({', '.join(seen) or 'none here'})"
+                faults.append(fault(("truth", "sensor"), reason))
+            if any(self.truth.arm_m):
+                faults.append(fault(("truth", "arm_m"), f"should be left out, it is that of {self.truth.sensor}"))
         if (self.initial.roll_deg is None) != (self.initial.pitch_deg is None):
             faults.append(fault(("initial",), "roll_deg and pitch_deg should be given together or not at all"))
         return or_raise(self, faults)

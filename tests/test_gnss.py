@@ -251,25 +251,46 @@ def test_covariance_of_a_point_is_that_of_its_perturbed_positions():
     assert_allclose(np.cov(p.T) / scale, 1e-8 * moved.cov[0, POS, POS] / scale, atol=0.013)
 
 
-def test_truth_of_a_point_on_another_clock_is_met_exactly():
-    """The rig's truth has an arm and the antenna's stamps, 0.2 s early: two keyframes."""
+ARM = np.array([0.7, -0.4, 1.9])
+
+
+def track(at: Trajectory, late_ns: int) -> Log:
+    """The exact track of a point at ARM as truth, stamped late."""
+    point = at.position_n + matrix_from_quat(at.quat_xyzw) @ ARM
+    series = Series("/truth", "geometry_msgs/msg/PoseStamped", at.t_ns + late_ns, {"position": point})
+    return Log("log.mcap", {"/truth": series})
+
+
+def test_truth_of_a_point_with_an_arm_is_met_exactly():
     at = trajectory()
-    text = RIG + "truth: {topic: /truth, arm_m: [0.7, -0.4, 1.9], clock: gnss}"
-    rig = parse_rig(text, "rig")
-    point = at.position_n + matrix_from_quat(at.quat_xyzw) @ rig.truth.arm
-    series = Series("/truth", "geometry_msgs/msg/PoseStamped", at.t_ns - NS // 5, {"position": point})
-    log = Log("log.mcap", {"/truth": series})
-    truth = truth_for("/truth", log, rig, {"gnss_clock_offset_s": Calibrated(-0.2, 0.01, True)})
+    rig = parse_rig(RIG + "truth: {topic: /truth, arm_m: [0.7, -0.4, 1.9]}", "rig")
+    truth = truth_for("/truth", track(at, 0), rig, {})
     errors = trajectory_errors(at, truth)
     assert len(errors.rows) == len(at)
     assert_allclose(errors.position_n, 0.0, atol=1e-12)
     without_arm = trajectory_errors(at, replace(truth, arm_b=np.zeros(3)))
-    assert_allclose(np.linalg.norm(without_arm.position_n, axis=1), np.linalg.norm(rig.truth.arm))
+    assert_allclose(np.linalg.norm(without_arm.position_n, axis=1), np.linalg.norm(ARM))
 
 
-def test_truth_clock_must_be_a_sensor():
-    with pytest.raises(RigError, match=r"truth\.clock: should be a sensor with a clock offset \(gnss\)"):
-        parse_rig(RIG + "truth: {topic: /truth, clock: prism}", "rig")
+def test_truth_of_a_sensors_point_takes_arm_and_clock_as_found():
+    """Stamps 0.2 s early, two keyframes; without the sensor its entry in the rig counts."""
+    at = trajectory()
+    found = {
+        "gnss_clock_offset_s": Calibrated(-0.2, 0.01, True),
+        "gnss_lever_arm_m": Calibrated(tuple(ARM), (0.01, 0.01, 0.01), True),
+    }
+    for entry, calibration in (("", found), (", arm_m: [0.7, -0.4, 1.9], clock_offset_s: -0.2", {})):
+        rig = parse_rig(RIG.replace("/fix}", f"/fix{entry}}}") + "truth: {topic: /truth, sensor: gnss}", "rig")
+        errors = trajectory_errors(at, truth_for("/truth", track(at, -NS // 5), rig, calibration))
+        assert len(errors.rows) == len(at)
+        assert_allclose(errors.position_n, 0.0, atol=1e-12)
+
+
+def test_faults_of_origin_and_truth():
+    with pytest.raises(RigError, match=r"truth\.sensor: should be a sensor of positions \(gnss\)"):
+        parse_rig(RIG + "truth: {topic: /truth, sensor: prism}", "rig")
+    with pytest.raises(RigError, match=r"truth\.arm_m: should be left out, it is that of gnss"):
+        parse_rig(RIG + "truth: {topic: /truth, sensor: gnss, arm_m: [0, 0, 1]}", "rig")
     with pytest.raises(RigError, match=r"origin\.longitude_deg: should come with latitude_deg"):
         parse_rig(RIG + "origin: {longitude_deg: 8}", "rig")
 
