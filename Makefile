@@ -1,4 +1,4 @@
-# make demo   simulate a roadheader, smooth its log, compare with the truth
+# make demo   simulate a roadheader, smooth and filter its log, compare with the truth
 # make test   lint and tests
 # Everything runs in $(VENV), made on first use from the pinned versions in constraints.txt.
 
@@ -16,8 +16,8 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3 python3.12 python3.13,\
 demo: $(READY)
 	@mkdir -p demo
 	$(BIN)/python -m datasets make tbm-drive -o demo/tbm-drive.mcap --duration 120
-	$(BIN)/tbmfg run demo/tbm-drive.mcap --truth auto -o demo/result --force
-	@echo "results are in demo/result: summary.json, trajectory.tum, result.mcap (opens in Foxglove)"
+	$(BIN)/tbmfg compare demo/tbm-drive.mcap --estimators batch,ins --truth auto -o demo/result --force
+	@echo "the comparison is in demo/result/compare.json, the smoothed trajectory in demo/result/batch"
 
 test: lint
 	$(BIN)/python -m pytest -n 2
