@@ -1,0 +1,64 @@
+"""From a log and a rig to the problem that every estimator solves: once per log, alike for all.
+
+Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, the clock offset and the
+noise factor of the IMU, found from the log itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tbmfg import gnss
+from tbmfg.errors import EstimationError, RigError
+from tbmfg.inertial.steps import to_ns
+from tbmfg.prepare import search
+from tbmfg.prepare.samples import ALONE, imu_steps, is_position, losses, usable_samples
+from tbmfg.prepare.start import align
+from tbmfg.problem import Problem, breakdown_explained
+from tbmfg.rig import Rig
+from tbmfg.state import Interval
+from tbmfg.timeseries import Log
+
+Prepared = Problem
+
+
+def prepare(
+    log: Log,
+    rig: Rig,
+    *,
+    outages: tuple[tuple[str, float, float], ...] = (),
+    without: tuple[str, ...] = (),
+    progress: Callable[[str, float], None] | None = None,
+) -> Problem:
+    """Everything an estimator needs.
+
+    ``outages`` are (sensor, start, end) in s from the first IMU sample, stamps as recorded; ``without`` names sensors
+    to leave aside. Raises LogError without IMU samples, RigError for names that the rig does not have.
+    """
+    tell = progress or (lambda stage, share: None)
+    tell("prepare", 0.0)
+    for name in [sensor for sensor, _, _ in outages] + list(without):
+        if name not in rig.sensors:
+            raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
+    log, rig, said = gnss.into_n(log, rig)
+    warnings: list[str] = [*log.damage, *losses(log, rig, without), *said]
+    steps, imu_counts = imu_steps(log, rig, outages, warnings)
+    missing: list[str] = []
+    samples, counts = usable_samples(log, rig, steps, outages, without, missing)
+    if not samples and rig.motion is None:
+        raise EstimationError("; ".join([f"{log.path}: {ALONE}", *missing]))
+    warnings += missing
+    counts = {"imu": imu_counts, **counts}
+    with breakdown_explained("preparing the estimate"):
+        setup = align(rig, steps, samples, counts, warnings)
+        offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
+        problem = search.find(setup, offsets, tell)
+    problem.intervals = [
+        *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
+        *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
+        *(Interval("zero_velocity", "standing", *(int(t) for t in to_ns(steps, np.array(s)))) for s in setup.still),
+    ]
+    tell("prepare", 1.0)
+    return problem

@@ -1,0 +1,119 @@
+"""The problem for given clock offsets and noise: keyframes, rows, first state and prior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tbmfg import measure
+from tbmfg.errors import EstimationError
+from tbmfg.prepare.samples import ALONE, is_position
+from tbmfg.prepare.start import Setup
+from tbmfg.problem import Inertial, Prior, Problem
+from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, kind_of
+from tbmfg.state import BG, NAV, ROT
+from tbmfg.timeseries import Floats
+
+GYROCOMPASS_SLACK = np.deg2rad(0.1)  # of the coarse heading beside the bias: noise and motion of the still stretch
+
+
+def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float | None = None) -> Problem:
+    """The problem for given clock offsets and noise factors (gyro, accelerometer), up to ``end_s``."""
+    rig, steps = setup.rig, setup.steps
+    end_s = steps.end_s if end_s is None else min(end_s, steps.end_s)
+    samples = {
+        name: s.select(rows)
+        for name, s in setup.samples.items()
+        if (rows := s.t_s - offsets.get(name, 0.0) <= end_s).sum() >= 2
+    }
+    mean, begin = setup.parameters.mean.copy(), setup.parameters.mean.copy()
+    for name, offset in offsets.items():
+        k = setup.parameters.names.index(f"{name}.clock_offset")
+        mean[k], begin[k] = mean[k] - offset, 0.0
+    parameters = replace(setup.parameters, mean=mean, start=begin)
+
+    fixes = [s.t_s - offsets[name] for name, s in samples.items() if is_position(rig, name)]
+    fixes_s = np.sort(np.concatenate(fixes)) if fixes else np.zeros(0)
+    edges = measure.keyframe_edges(rig.keyframes, steps.edges_s, end_s, fixes_s)
+    keyframes = steps.edges_s[edges]
+    rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
+    for name, s in samples.items():
+        sensor, calib = rig.sensors[name], parameters.slice(name)
+        if isinstance(sensor, PositionSensor):
+            rows.append(measure.position_rows(sensor, s, offsets[name], keyframes, setup.frame, setup.origin_n, calib))
+        elif isinstance(sensor, Odometer):
+            rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
+        elif isinstance(sensor, Magnetometer):
+            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, rig.origin.x_axis_azimuth, calib))
+        elif isinstance(sensor, Barometer):
+            rows.append(measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names)))
+            drift_names.append(f"{name}.bias")
+            drift_walk.append(sensor.bias_walk)
+            drift_sd.append(max(sensor.bias_sd, 1e-6))
+            drift_start.append(float(np.median(s.values[:20])))
+    if setup.still:
+        rows.append(measure.velocity_rows(keyframes, setup.still, setup.still_sigma))
+    position, velocity = first_state(setup, offsets)
+    if rig.motion is not None:
+        rows.append(measure.bounded_rows(keyframes, position, rig.motion.radius, rig.motion.speed))
+    if not any(kind_of(r.sensor) != "zero_velocity" for r in rows):
+        raise EstimationError(ALONE)
+
+    imu = rig.imu
+    inertial = Inertial(
+        steps, setup.gyro, setup.acc,
+        (factors[0] * imu.gyro_density) ** 2, (factors[1] * imu.acc_density) ** 2,
+        imu.gyro_walk**2, imu.acc_walk**2, rig.origin.rate_n, np.array([0.0, 0.0, -rig.origin.gravity]),
+    )  # fmt: skip
+    drift = np.array(drift_start) - setup.origin_n[2] - position[2] if drift_names else np.zeros(0)
+    x = np.concatenate([setup.R_start.ravel(), position, velocity, np.zeros(3), setup.bias_gyro, drift])
+    prior = prior_of(setup, x, np.array(drift_sd), bool(fixes))
+    return Problem(
+        rig, inertial, edges, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
+        dict(offsets), setup.counts, {}, [], setup.warnings,
+    )  # fmt: skip
+
+
+def first_state(setup: Setup, offsets: dict[str, float]) -> tuple[Floats, Floats]:
+    """Position (from the origin) and velocity in n at the first edge: from the rig, else from the first fixes."""
+    rig = setup.rig
+    position, velocity = rig.initial.position, rig.initial.velocity
+    for name, s in setup.samples.items():
+        if not is_position(rig, name):
+            continue
+        t = s.t_s - offsets[name] - setup.steps.edges_s[0]
+        rows = t < t[0] + 2.0
+        degree = 1 if rows.sum() >= 5 and t[0] < 1.0 else 0
+        fit = np.polynomial.polynomial.polyfit(t[rows], s.values[rows], degree)
+        position = fit[0] - setup.R_start @ rig.sensors[name].arm if position is None else position
+        velocity = fit[1] if velocity is None and degree else velocity
+        break
+    position = np.zeros(3) if position is None else position - setup.origin_n
+    return position, np.zeros(3) if velocity is None else velocity
+
+
+def prior_of(setup: Setup, x: Floats, drift_sd: Floats, has_fixes: bool) -> Prior:
+    """Covariance of the first state; attitude sds are about n's axes and turned into b."""
+    rig = setup.rig
+    start, R = rig.initial, x[:9].reshape(3, 3)
+
+    def covariance(yaw_sd: float) -> Floats:
+        sd_n = np.array([start.tilt_sd, start.tilt_sd, yaw_sd])
+        cov = np.zeros((NAV + len(drift_sd), NAV + len(drift_sd)))
+        cov[:3, :3] = R.T @ np.diag(sd_n**2) @ R
+        # without a given position the first fix is it: the prior must then not compete with the fixes
+        position_sd = start.position_sd if start.position is not None or not has_fixes else max(start.position_sd, 10.0)
+        sd = np.repeat([position_sd, start.velocity_sd, rig.imu.acc_bias_sd, rig.imu.gyro_bias_sd], 3)
+        cov[3:, 3:] = np.diag(np.concatenate([sd, drift_sd]) ** 2)
+        return cov
+
+    filter_cov = covariance(setup.yaw_sd)
+    if setup.gyrocompassed:
+        # the heading was found with the gyro, so its error is the bias's: d_rot = -up_b (east_b . d_bg) / w_north
+        earth_n = rig.origin.rate_n
+        east_b = R.T @ np.cross(earth_n, [0.0, 0.0, 1.0]) / np.linalg.norm(earth_n[:2]) ** 2
+        cross = -np.outer(R[2], east_b) * rig.imu.gyro_bias_sd**2
+        filter_cov[ROT, BG], filter_cov[BG, ROT] = cross, cross.T
+        filter_cov[ROT, ROT] += np.outer(R[2], R[2]) * GYROCOMPASS_SLACK**2
+    return Prior(x, covariance(start.yaw_sd), filter_cov)

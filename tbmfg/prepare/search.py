@@ -1,0 +1,101 @@
+"""Clock offsets and the noise of the IMU on this machine, found from the log itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from tbmfg.filters import ins
+from tbmfg.inertial import alignment
+from tbmfg.inertial.noise import spectral_floor
+from tbmfg.prepare.build import build
+from tbmfg.prepare.start import Setup
+from tbmfg.problem import Problem
+from tbmfg.state import Calibrated
+from tbmfg.timeseries import Floats
+
+SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
+FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
+SCALE_PRIOR_LOG2 = 0.7  # sd of log2 of the noise against the spectrum's floor, for logs that hardly say
+
+
+def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], None]) -> Problem:
+    """Clock offsets and noise factors from the log, alternating, then the problem at what was found.
+
+    A constant's last estimate by a filter holds all that the log says about it, so the offsets are states of ``ins``;
+    keyframes move with them until they stand. Noise: the IMU's own spectrum says how much noisier than the data
+    sheet gyro and accelerometer can be at most; one scale on both minimises the filter's likelihood cost.
+    """
+    imu = setup.rig.imu
+    auto = imu.noise_factor == "auto"
+    floors = spectral_floor(setup.steps) if auto else (imu.gyro_density, imu.acc_density)
+    split = np.clip([floors[0] / imu.gyro_density, floors[1] / imu.acc_density], *FACTOR_RANGE)
+    scale, sd = (1.0 if auto else float(imu.noise_factor)), 0.0
+    names = setup.parameters.names
+    unknown = [n for n in offsets if setup.parameters.sd[names.index(f"{n}.clock_offset")] > 0]
+    for name in unknown:
+        offsets[name] = _coarse_offset(setup, name)
+    for turn in range(2 if auto and unknown else 1):
+        if unknown:
+            offset_sd = _settle_offsets(setup, offsets, scale * split, unknown)
+        if auto:
+            scale, sd = _noise_scale(setup, offsets, split, scale)
+        tell("prepare", 0.5 + 0.25 * turn)
+    factors = np.maximum(scale * split, 1.0) if auto else scale * split
+    problem = build(setup, offsets, factors)
+    named = {"noise_factor_gyro": factors[0], "noise_factor_acc": factors[1], "noise_factor": np.sqrt(np.prod(factors))}
+    for key, value in named.items():
+        problem.calibration[key] = Calibrated(float(value), float(value * sd / scale), auto)
+    for name in unknown:
+        problem.calibration[f"{name}_clock_offset_s"] = Calibrated(offsets[name], offset_sd[name], True)
+    return problem
+
+
+def _settle_offsets(setup: Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> dict[str, float]:
+    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place; their sds in s."""
+    for _ in range(4):
+        problem = build(setup, offsets, factors, SEARCH_S)
+        filtered = ins.run(problem)
+        where = {name: problem.parameters.names.index(f"{name}.clock_offset") for name in unknown}
+        for name, k in where.items():
+            offsets[name] += float(filtered.c[k])
+        if max(abs(filtered.c[k]) for k in where.values()) < 1e-4:
+            break
+    return {name: float(np.sqrt(filtered.c_cov[k, k])) for name, k in where.items()}
+
+
+def _coarse_offset(setup: Setup, name: str) -> float:
+    """Clock offset by fitting the sensor's motion to the inertial one over three sd of the prior."""
+    sensor, s = setup.rig.sensors[name], setup.samples[name]
+    spread = 3.0 * sensor.clock_offset_sd
+    grid = sensor.clock_offset + np.linspace(-spread, spread, 2 * max(2, int(np.ceil(spread / 0.02))) + 1)
+    R_level = setup.R_start
+    fit = alignment.fit_motion(setup.steps, setup.bias_gyro, R_level, s.t_s, s.values, grid, setup.rig.origin.gravity)
+    if fit is None:
+        setup.warnings.append(
+            f"{name}: clock offset not observable: the machine hardly moved; it stays at the rig's value"
+        )
+        return sensor.clock_offset
+    return fit.clock_offset_s
+
+
+def _noise_scale(setup: Setup, offsets: dict[str, float], split: Floats, start: float) -> tuple[float, float]:
+    """Scale on ``split`` that minimises the cost of ``ins`` (-2 log likelihood), and its sd from the curvature in
+    the logarithm; at least what the data sheet says, at most what the spectrum allows."""
+    costs: dict[float, float] = {}
+
+    def cost(log2: float) -> float:
+        if log2 not in costs:
+            problem = build(setup, offsets, 2.0**log2 * split, SEARCH_S)
+            costs[log2] = ins.run(problem, fixed=("clock_offset",)).cost + (log2 / SCALE_PRIOR_LOG2) ** 2
+        return costs[log2]
+
+    step, best = 0.5, round(2.0 * np.log2(start)) / 2.0
+    while (lower := min((best - step, best + step), key=cost)) is not None and cost(lower) < cost(best):
+        best = lower
+    a, b, c = (cost(best + k) for k in (-step, 0.0, step))
+    curvature = (a - 2.0 * b + c) / step**2
+    vertex = best + 0.5 * step * (a - c) / (a - 2.0 * b + c)
+    scale = 2.0**vertex
+    return float(scale), float(scale * np.sqrt(2.0 / curvature) * np.log(2.0))

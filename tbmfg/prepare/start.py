@@ -1,0 +1,182 @@
+"""How the machine starts: attitude, heading, gyro bias, and where it stands still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from tbmfg import earth
+from tbmfg.geometry import rotation_from_rpy, rotation_z, yaw_of
+from tbmfg.inertial import alignment
+from tbmfg.inertial.steps import Steps, compensate
+from tbmfg.inertial.strapdown import rotations
+from tbmfg.measure import GyroFrame, Samples
+from tbmfg.prepare.samples import is_position
+from tbmfg.problem import Parameters
+from tbmfg.rig import Magnetometer, Odometer, PositionSensor, Rig
+from tbmfg.state import Counts
+from tbmfg.timeseries import Floats
+
+GYROCOMPASS = np.deg2rad(15.0)  # a gyro whose bias leaves a larger doubt than this cannot find north
+
+
+@dataclass(slots=True)
+class Setup:
+    """What stays the same while offset and noise factor are searched."""
+
+    rig: Rig
+    steps: Steps
+    frame: GyroFrame
+    gyro: Floats
+    acc: Floats
+    samples: dict[str, Samples]
+    parameters: Parameters
+    R_start: Floats
+    yaw_sd: float
+    gyrocompassed: bool
+    still: list[tuple[float, float]]
+    still_sigma: Floats
+    bias_gyro: Floats
+    origin_n: Floats
+    counts: dict[str, Counts]
+    warnings: list[str] = field(default_factory=list)
+
+
+def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> Setup:
+    """Initial attitude, gyro bias, and where the machine stands."""
+    still = alignment.still_intervals(steps)
+    bias_gyro = np.zeros(3)
+    # a tight bias prior must not swallow the Earth rate that a good gyro would find north with
+    if still and rig.imu.gyro_bias_sd > 5.0 * earth.RATE:
+        longest = max(still, key=lambda s: s[1] - s[0])
+        bias_gyro = steps.gyro[alignment.rows_between(steps, *longest)].mean(axis=0)
+    gyro, acc = compensate(steps, bias_gyro, np.zeros(3))
+    R_0t = rotations(steps.edges_s, gyro, bias_gyro)
+    frame = GyroFrame(steps, R_0t, gyro - bias_gyro, bias_gyro)
+    R_level = alignment.level_at_start(steps, R_0t, still)
+
+    start = rig.initial
+    R_level = _with_given_tilt(R_level, start.roll, start.pitch)
+    position = next((s for name, s in samples.items() if is_position(rig, name)), None)
+    bound = alignment.gyrocompass_bound(rig.imu.gyro_bias_sd, rig.origin.rate_n)
+    R_start, yaw_sd, gyrocompassed = R_level, start.yaw_sd, False
+    if start.yaw is not None:
+        R_start = rotation_z(start.yaw - float(yaw_of(R_level))) @ R_level
+    elif (found := _magnetic_heading(rig, samples, frame, R_level)) is not None:
+        R_start, yaw_sd = rotation_z(found) @ R_level, min(yaw_sd, np.deg2rad(10.0))
+    elif still and bound < GYROCOMPASS:
+        turn = alignment.gyrocompass(steps, R_0t, still, R_level, rig.origin.rate_n)
+        R_start, yaw_sd, gyrocompassed = rotation_z(turn) @ R_level, bound, True
+        warnings.append(
+            f"heading by gyrocompass: at first no better than bias / (w cos lat) = {np.rad2deg(bound):.2g} deg (1 sd)"
+        )
+    elif position is not None:
+        sensor = rig.sensors[position.sensor]
+        spread = 3.0 * sensor.clock_offset_sd
+        offsets = sensor.clock_offset + (np.arange(-spread, spread + 1e-9, 0.02) if spread else np.zeros(1))
+        fit = alignment.fit_motion(
+            steps, bias_gyro, R_level, position.t_s, position.values, offsets, rig.origin.gravity
+        )
+        if fit is None:
+            warnings.append(
+                "heading is not observable: no stretch of 8 s has motion enough to give it; set initial.yaw_deg"
+            )
+        else:
+            R_start, yaw_sd = rotation_z(fit.heading) @ R_level, max(2.0 * fit.heading_sd, np.deg2rad(5.0))
+    else:
+        warnings.append("heading is a guess: no magnetometer, no position sensor, no initial.yaw_deg; it is set to 0")
+
+    confirmed = _confirmed_rest(rig, samples, still) if rig.zero_velocity.enabled else []
+    sigma = np.hypot(rig.zero_velocity.sigma, _vibration_speed(steps, confirmed))
+    origin_n = np.round(np.median(position.values[:50], axis=0)) if position is not None else np.zeros(3)
+    return Setup(
+        rig, steps, frame, gyro, acc, samples, parameters_of(rig, samples), R_start, yaw_sd, gyrocompassed, confirmed,
+        np.full(3, sigma), bias_gyro, origin_n, counts, warnings,
+    )  # fmt: skip
+
+
+def _with_given_tilt(R_level: Floats, roll: float | None, pitch: float | None) -> Floats:
+    """The levelled start attitude with roll and pitch from the rig, where it gives them."""
+    if roll is None and pitch is None:
+        return R_level
+    found = np.array(
+        [np.arctan2(R_level[2, 1], R_level[2, 2]), -np.arcsin(np.clip(R_level[2, 0], -1, 1)), yaw_of(R_level)]
+    )
+    given = np.array([found[0] if roll is None else roll, found[1] if pitch is None else pitch, found[2]])
+    return rotation_from_rpy(given)
+
+
+def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_level: Floats) -> float | None:
+    """Turn about the vertical from the levelled start frame to n by the first ten seconds of magnetometer, or None."""
+    for name, s in samples.items():
+        sensor = rig.sensors[name]
+        if isinstance(sensor, Magnetometer):
+            rows = s.t_s < s.t_s[0] + 10.0
+            b = (s.values[rows] - sensor.hard_iron) @ sensor.R_bm.T
+            h = np.einsum("nij,nj->ni", frame.at(s.t_s[rows] - sensor.clock_offset), b).mean(axis=0) @ R_level.T
+            north = earth.north_direction(rig.origin.x_axis_azimuth) - sensor.declination
+            return float(north - np.arctan2(h[1], h[0]))
+    return None
+
+
+def _confirmed_rest(
+    rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
+    confirmed = []
+    for start, end in still:
+        for name, s in samples.items():
+            sensor = rig.sensors[name]
+            t = s.t_s - getattr(sensor, "clock_offset", 0.0)
+            rows = (t >= start) & (t <= end)
+            if rows.sum() < 3:
+                continue
+            values = s.values[rows]
+            if isinstance(sensor, PositionSensor):
+                spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
+                resting = bool(np.all(spread < 5.0 * s.sigma[rows].max(axis=1)))
+            elif isinstance(sensor, Odometer):
+                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
+            else:
+                continue
+            # the stamps' offset may be unknown: leave its spread free on either side
+            margin = 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
+            first, last = float(t[rows][0]) + margin, float(t[rows][-1]) - margin
+            if resting and last > first:
+                confirmed.append((first, last))
+            break
+    return confirmed
+
+
+def _vibration_speed(steps: Steps, intervals: list[tuple[float, float]]) -> float:
+    """RMS of the vibration's velocity per axis [m/s] while standing: what a zero velocity must allow for."""
+    squares = []
+    for start, end in intervals:
+        rows = alignment.rows_between(steps, start, min(end, start + 10.0))
+        force = steps.acc[rows]
+        if len(force) < 10:
+            continue
+        v = np.cumsum((force - force.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
+        # drift of the mean over a second is no vibration
+        size = max(1, round(1.0 / steps.period_s))
+        smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
+        squares.append(np.mean((v - smooth)[size:-size] ** 2) if len(v) > 3 * size else np.mean((v - smooth) ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
+    """The constant calibrations of the sensors at hand, with the rig's priors."""
+    entries: list[tuple[str, float, float]] = []
+    for name in samples:
+        sensor = rig.sensors[name]
+        if isinstance(sensor, PositionSensor):
+            entries += [(f"{name}.arm_{axis}", sensor.arm[k], sensor.arm_sd) for k, axis in enumerate("xyz")]
+            entries += [(f"{name}.clock_offset", sensor.clock_offset, sensor.clock_offset_sd)]
+        elif isinstance(sensor, Odometer):
+            entries += [(f"{name}.scale", sensor.scale, sensor.scale_sd)]
+            entries += [(f"{name}.{axis}", getattr(sensor, axis), sensor.mounting_sd) for axis in ("yaw", "pitch")]
+        elif isinstance(sensor, Magnetometer):
+            entries += [(f"{name}.declination", sensor.declination, sensor.declination_sd)]
+    names, mean, sd = zip(*entries, strict=True) if entries else ((), (), ())
+    return Parameters(tuple(names), np.array(mean, float), np.array(sd, float), np.array(mean, float))
