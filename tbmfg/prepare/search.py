@@ -15,6 +15,7 @@ from tbmfg.problem import Problem
 from tbmfg.state import Calibrated
 from tbmfg.timeseries import Floats
 
+REACH_SD = 3.0  # sds of its prior within which a clock offset is looked for
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
 FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
 SCALE_PRIOR_LOG2 = 0.7  # sd of log2 of the noise against the spectrum's floor, for logs that hardly say
@@ -53,22 +54,38 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
 
 
 def _settle_offsets(setup: Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> dict[str, float]:
-    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place; their sds in s."""
+    """Move the keyframes with the offsets that ``ins`` estimates until they stand, in place; their sds in s.
+
+    The filter takes the present offset for the prior's mean. Where that lies ``mu`` from it, the estimate moves by
+    variance / prior variance x mu: nothing where the log tells the offset, back to the prior where it does not.
+    """
+    parameters = setup.parameters
+    where = {name: parameters.names.index(f"{name}.clock_offset") for name in unknown}
     for _ in range(4):
-        problem = build(setup, offsets, factors, SEARCH_S)
-        filtered = ins.run(problem)
-        where = {name: problem.parameters.names.index(f"{name}.clock_offset") for name in unknown}
+        filtered = ins.run(build(setup, offsets, factors, SEARCH_S))
+        moved = 0.0
         for name, k in where.items():
-            offsets[name] += float(filtered.c[k])
-        if max(abs(filtered.c[k]) for k in where.values()) < 1e-4:
+            mean, sd, now = parameters.mean[k], parameters.sd[k], offsets[name]
+            step = filtered.c[k] + filtered.c_cov[k, k] / sd**2 * (mean - now)
+            offsets[name] = float(np.clip(now + step, mean - REACH_SD * sd, mean + REACH_SD * sd))
+            moved = max(moved, abs(offsets[name] - now))
+        if moved < 1e-4:
             break
+    for name, k in where.items():
+        if abs(offsets[name] - parameters.mean[k]) > 0.999 * REACH_SD * parameters.sd[k]:
+            line = (
+                f"{name}: the clock offset ran to {REACH_SD:.0f} sd of its prior, {offsets[name]:.3f} s, and is held "
+                f"there; check sensors.{name}.clock_offset_s and its sd, the lever arm and the sensor's sigma"
+            )
+            if line not in setup.warnings:
+                setup.warnings.append(line)
     return {name: float(np.sqrt(filtered.c_cov[k, k])) for name, k in where.items()}
 
 
 def _coarse_offset(setup: Setup, name: str) -> float:
     """Clock offset by fitting the sensor's motion to the inertial one over three sd of the prior."""
     sensor, s = setup.rig.sensors[name], setup.samples[name]
-    spread = 3.0 * sensor.clock_offset_sd
+    spread = REACH_SD * sensor.clock_offset_sd
     grid = sensor.clock_offset + np.linspace(-spread, spread, 2 * max(2, int(np.ceil(spread / 0.02))) + 1)
     R_level = setup.R_start
     fit = alignment.fit_motion(setup.steps, setup.bias_gyro, R_level, s.t_s, s.values, grid, setup.rig.origin.gravity)

@@ -16,6 +16,7 @@ from tbmfg.smoother.graph import States
 from tbmfg.timeseries import Floats
 
 MAX_ITERATIONS = 30
+OFFSET_REACH_S = 0.02  # a clock offset beyond the one found by ``prepare``: the prism's model is first order in it
 CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
 
 
@@ -40,6 +41,7 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
     """
     free, n, d = problem.parameters.free, len(x), problem.size
     m = len(free)
+    clocks = [k for k in free if problem.parameters.names[k].endswith("clock_offset")]
     states = States(x.copy(), c.copy())
     imu = graph.imu_graph(problem, states.x), graph.no_bias(n)
     blocks, nis, cost = _linearise(problem, imu, states, free)
@@ -51,6 +53,7 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
         dx, dc = chain.solve()
         candidate = States(correct_states(states.x, dx), states.c.copy())
         candidate.c[free] += dc
+        candidate.c[clocks] = np.clip(candidate.c[clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
         new_blocks, new_nis, new_cost = _linearise(problem, imu, candidate, free)
         if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
             converged = damping < 1e-6 and cost - new_cost < CONVERGED * 1e-3 * (1.0 + cost)
