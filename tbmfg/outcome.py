@@ -130,5 +130,6 @@ def _vague_heading(path: Trajectory) -> list[str]:
     span = t[vague]
     return [
         f"heading is known to {np.rad2deg(sd[vague].max()):.0f} deg only, {span[0]:.0f}-{span[-1]:.0f} s "
-        f"({vague.mean():.0%} of the keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by the prism would fix it"
+        f"({vague.mean():.0%} of the keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by "
+        "the prism would fix it"
     ]

@@ -42,7 +42,7 @@ def refuse_existing(output: str | Path, force: bool) -> None:
 
 
 def write_text(path: str | Path, text: str, *, force: bool = False) -> None:
-    """Write one text file, which appears under its name only when complete; raises where it exists without ``force``."""
+    """Write one text file, which appears under its name when complete; raises where it exists without ``force``."""
     from tbmfg.mcap.writer import replacing
 
     refuse_existing_file(path, force)
