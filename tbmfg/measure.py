@@ -80,7 +80,8 @@ class GyroFrame:
         """Mean angular rate in b [rad/s] around each time, (n, 3)."""
         total = np.concatenate([np.zeros((1, 3)), np.cumsum(self.gyro * self.steps.dt[:, None], axis=0)])
         edges = self.steps.edges_s
-        low, high = np.clip(t_s - window_s, edges[0], edges[-1]), np.clip(t_s + window_s, edges[0], edges[-1])
+        middle = np.clip(t_s, edges[0] + window_s, max(edges[-1] - window_s, edges[0] + window_s))
+        low, high = middle - window_s, np.minimum(middle + window_s, edges[-1])
         angle = [np.interp(high, edges, total[:, a]) - np.interp(low, edges, total[:, a]) for a in range(3)]
         return np.stack(angle, axis=1) / (high - low)[:, None]
 
