@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
+from tbmfg import diagnosis
 from tbmfg.geometry import quat_from_matrix
 from tbmfg.problem import GATE, Problem
-from tbmfg.state import NAV, ROT, Calibrated, Counts, Innovations, Result, Trajectory
+from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats
-
-UNOBSERVED = 0.9  # posterior over prior sd from which a calibration counts as not observed
-VAGUE_HEADING = np.deg2rad(10.0)
 
 
 def trajectory(problem: Problem, x: Floats, cov: Floats) -> Trajectory:
@@ -47,14 +45,19 @@ def result(
         rows.sensor: Innovations(path.t_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
         for rows in problem.rows
     }
+    stretches = diagnosis.gated_stretches(innovations)
     return Result(
         estimator=estimator,
         trajectory=path,
         calibration={**calibrations(problem, c, sd), **_drifts(problem, x, cov)},
         counts=_counts(problem, gated),
         innovations=innovations,
-        intervals=list(problem.intervals),
-        warnings=[*_unobserved(problem, sd), *_vague_heading(path)],
+        intervals=[*problem.intervals, *stretches],
+        warnings=[
+            *diagnosis.unobserved(problem, path, sd),
+            *diagnosis.vague_heading(path),
+            *diagnosis.gated_in_words(stretches, problem.t0_ns),
+        ],
     )
 
 
@@ -106,30 +109,3 @@ def _counts(problem: Problem, gated: dict[str, np.ndarray]) -> dict[str, Counts]
     return {
         name: replace(count, unused=count.unused + count.received - count.parts()) for name, count in counts.items()
     }
-
-
-def _unobserved(problem: Problem, sd: Floats) -> list[str]:
-    parameters = problem.parameters
-    return [
-        f"{parameters.names[k]} is not observable on this log: "
-        f"its sd stays {sd[k]:.3g} of the prior's {parameters.sd[k]:.3g}"
-        for k in parameters.free
-        if sd[k] > UNOBSERVED * parameters.sd[k]
-    ]
-
-
-def _vague_heading(path: Trajectory) -> list[str]:
-    """Say from when to when the heading is not known, and what would help."""
-    R = path.rotations()
-    up_b = R[:, 2, :]
-    sd = np.sqrt(np.einsum("ki,kij,kj->k", up_b, path.cov[:, ROT, ROT], up_b))
-    vague = sd > VAGUE_HEADING
-    if not vague.any():
-        return []
-    t = (path.t_ns - path.t_ns[0]) * 1e-9
-    span = t[vague]
-    return [
-        f"heading is known to {np.rad2deg(sd[vague].max()):.0f} deg only, {span[0]:.0f}-{span[-1]:.0f} s "
-        f"({vague.mean():.0%} of the keyframes); a magnetometer, initial.yaw_deg with its sd, or curved motion seen by "
-        "the prism would fix it"
-    ]

@@ -23,6 +23,7 @@ from tbmfg.timeseries import NS, Floats, Log, Series, Times
 if TYPE_CHECKING:
     from tbmfg.rig import Rig
 
+NIS_BINS = 60  # stretches of time that a summary gives the innovations in
 SUMMARY = "summary.json"
 # The summary is first to go and last to come: a folder that holds one holds a complete result.
 FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result.mcap", "rig.yaml", SUMMARY)
@@ -131,7 +132,7 @@ def summarise(result: Result, t0_ns: int) -> dict[str, Any]:
             }
             for interval in result.intervals
         ],
-        "innovations": {name: _innovation_summary(values) for name, values in result.innovations.items()},
+        "innovations": {name: _innovation_summary(values, t0_ns) for name, values in result.innovations.items()},
     }
 
 
@@ -146,7 +147,7 @@ def _diagnostics(result: Result) -> dict[str, str]:
     return lines | {f"warning {number}": text for number, text in enumerate(result.warnings, 1)}
 
 
-def _innovation_summary(innovations: Innovations) -> dict[str, Any]:
+def _innovation_summary(innovations: Innovations, t0_ns: int) -> dict[str, Any]:
     gated = np.asarray(innovations.gated, dtype=bool)
     accepted = np.asarray(innovations.nis, dtype=float)[~gated]
     return {
@@ -154,7 +155,21 @@ def _innovation_summary(innovations: Innovations) -> dict[str, Any]:
         "gated": int(gated.sum()),
         "dof": innovations.dof,
         "nis_per_dof": float(accepted.mean()) / innovations.dof if len(accepted) else None,
+        "over_time": _over_time(innovations, t0_ns),
     }
+
+
+def _over_time(innovations: Innovations, t0_ns: int) -> dict[str, list[float | None]]:
+    """Mean NIS per degree of freedom and share gated in equal stretches of time; ``end_s`` of each from ``t0_ns``."""
+    t_s = (innovations.t_ns - t0_ns) * 1e-9
+    if len(t_s) == 0:
+        return {"end_s": [], "nis_per_dof": [], "gated": []}
+    edges = np.linspace(t_s[0], t_s[-1], min(NIS_BINS, len(t_s)) + 1)
+    which = np.clip(np.searchsorted(edges, t_s, side="right") - 1, 0, len(edges) - 2)
+    count = np.bincount(which, minlength=len(edges) - 1)
+    sums = [np.bincount(which, v, minlength=len(count)) for v in (innovations.nis / innovations.dof, innovations.gated)]
+    nis, gated = (np.where(count > 0, total / np.maximum(count, 1), np.nan) for total in sums)
+    return {"end_s": edges[1:].tolist(), "nis_per_dof": nis.tolist(), "gated": gated.tolist()}
 
 
 def to_json(value: Any) -> str:

@@ -223,7 +223,10 @@ def test_summary_of_a_result():
         "estimated": True,
     }
     assert summary["sensors"]["prism"]["gated"] == 1
+    over_time = summary["innovations"]["prism"].pop("over_time")
     assert summary["innovations"]["prism"] == {"updates": 3, "gated": 1, "dof": 3, "nis_per_dof": 1.5}
+    assert over_time["nis_per_dof"] == [1.0, 2.0, 30.0]
+    assert over_time["gated"] == [0.0, 0.0, 1.0]
     assert summary["innovations"]["laser"]["nis_per_dof"] is None
     assert summary["intervals"] == [{"sensor": "prism", "kind": "outage", "start_s": 1.0, "end_s": 2.5}]
 
