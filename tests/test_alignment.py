@@ -8,7 +8,8 @@ from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy, rotation_z, wrap
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import make_steps
 from tbmfg.inertial.strapdown import rotations
-from tests.problems import flight, imu_series
+from tbmfg.prepare import prepare
+from tests.problems import drive, flight, imu_series, log_of
 
 RATE_HZ = 200
 G = 9.81
@@ -192,3 +193,16 @@ def test_heading_turns_with_the_frame():
     )
     assert wrap(other.heading - one.heading - np.radians(100.0)) == pytest.approx(0.0, abs=1e-9)
     assert other.heading_sd == pytest.approx(one.heading_sd, rel=1e-6)
+
+
+def test_heading_from_the_way_of_odometer_and_prism():
+    # the rig does not know the heading, the gyro cannot find north, and the drive is too gentle for its accelerations
+    settings = ("initial.yaw_sd_deg=180", "sensors.imu.gyro_bias_sd_dps=0.01")
+    simulation = drive(seed=2, duration=60.0, settings=settings)
+    kept = [s for s in simulation.log_series if s.topic != "/imu/mag"]
+    problem = prepare(log_of(kept), simulation.rig)
+    R_true = simulation.truth(np.array([(problem.t0_ns - simulation.start_ns) * 1e-9])).R[0]
+    turn = problem.prior.x[:9].reshape(3, 3) @ R_true.T
+    error = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+    assert abs(error) < 3.0 * np.sqrt(problem.prior.filter_cov[2, 2])
+    assert abs(error) < np.deg2rad(3.0)

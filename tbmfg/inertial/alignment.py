@@ -161,19 +161,28 @@ def _levelled_motion(steps: Steps, R_0t: Floats, start: float, window_s: float, 
 
 def _fit_window(inertial: _Inertial, t: Floats, position_n: Floats) -> tuple[float, float, float]:
     """Heading of the levelled frame, its sd, and the residual's variance; ``t`` s since the window's start."""
-    n = len(t)
     S = np.stack([np.interp(t, inertial.t, inertial.S[:, a]) for a in range(3)], axis=1)
-    shape = np.stack([np.ones(n), t, t**2 / 2], axis=1)
-    Q, _ = np.linalg.qr(shape)
-    S, z = S - Q @ (Q.T @ S), position_n - Q @ (Q.T @ position_n)
+    Q, _ = np.linalg.qr(np.stack([np.ones(len(t)), t, t**2 / 2], axis=1))
+    return _rotate_onto(S - Q @ (Q.T @ S), position_n - Q @ (Q.T @ position_n), taken=10)
+
+
+def turn_between(S: Floats, z: Floats, largest_sd: float) -> tuple[float, float] | None:
+    """Turn about the vertical that takes the way ``S`` (n, 3) onto ``z`` (n, 3), both about their means, and its sd
+    [rad]; None where the sd is above ``largest_sd``."""
+    heading, sd, _ = _rotate_onto(S, z, taken=4)
+    return (heading, sd) if sd < largest_sd else None
+
+
+def _rotate_onto(S: Floats, z: Floats, taken: int) -> tuple[float, float, float]:
+    """Least squares of z = Rz(heading) S: heading, its sd and the residual's variance; ``taken`` degrees of freedom
+    went into what was removed from both, the heading among them."""
     # (x, y) = [[Sx, -Sy], [Sy, Sx]] (cos, sin): orthogonal columns of equal length
-    energy = np.sum(S[:, :2] ** 2)
-    cos = np.sum(S[:, :2] * z[:, :2]) / max(energy, 1e-12)
-    sin = np.sum(S[:, 0] * z[:, 1] - S[:, 1] * z[:, 0]) / max(energy, 1e-12)
-    heading = np.arctan2(sin, cos)
-    fitted = S @ rotation_z(heading).T
-    variance = np.sum((z - fitted) ** 2) / (3 * n - 10) + 1e-12
-    return heading, float(np.sqrt(variance / max(energy, 1e-12))), variance
+    energy = max(float(np.sum(S[:, :2] ** 2)), 1e-12)
+    cos = np.sum(S[:, :2] * z[:, :2]) / energy
+    sin = np.sum(S[:, 0] * z[:, 1] - S[:, 1] * z[:, 0]) / energy
+    heading = float(np.arctan2(sin, cos))
+    variance = float(np.sum((z - S @ rotation_z(heading).T) ** 2)) / max(S.size - taken, 1) + 1e-12
+    return heading, float(np.sqrt(variance / energy)), variance
 
 
 def _vertex(x: Floats, y: Floats, best: int) -> float:

@@ -18,6 +18,8 @@ from tbmfg.rig import Magnetometer, Odometer, PositionSensor, Rig
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats
 
+COURSE_S = 120.0  # of driving that a heading is taken from
+COURSE_SD = np.deg2rad(5.0)  # a way that leaves a larger doubt than this is no course
 GYROCOMPASS = np.deg2rad(15.0)  # a gyro whose bias leaves a larger doubt than this cannot find north
 
 
@@ -71,6 +73,8 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
         warnings.append(
             f"heading by gyrocompass: at first no better than bias / (w cos lat) = {np.rad2deg(bound):.2g} deg (1 sd)"
         )
+    elif (course := _course_heading(rig, samples, frame, R_level)) is not None:
+        R_start, yaw_sd = rotation_z(course[0]) @ R_level, max(2.0 * course[1], np.deg2rad(2.0))
     elif position is not None:
         sensor = rig.sensors[position.sensor]
         spread = 3.0 * sensor.clock_offset_sd
@@ -118,6 +122,29 @@ def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R
             north = earth.north_direction(rig.origin.x_axis_azimuth) - sensor.declination
             return float(north - np.arctan2(h[1], h[0]))
     return None
+
+
+def _course_heading(
+    rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_level: Floats
+) -> tuple[float, float] | None:
+    """Turn about the vertical from the levelled start frame to n, and its sd [rad]: the way by odometer and gyro laid
+    onto that of the tracked point, over the log's first two minutes. None without both, or without a way to compare."""
+    tracked = next((s for name, s in samples.items() if is_position(rig, name)), None)
+    wheel = next((s for name, s in samples.items() if isinstance(rig.sensors[name], Odometer)), None)
+    if tracked is None or wheel is None:
+        return None
+    point, odometer = rig.sensors[tracked.sensor], rig.sensors[wheel.sensor]
+    t, dt = wheel.t_s - odometer.clock_offset, np.diff(wheel.t_s, prepend=wheel.t_s[0])
+    ahead_b = rotation_from_rpy(np.array([0.0, odometer.pitch, odometer.yaw]))[:, 0]
+    way = np.cumsum(frame.at(t) @ ahead_b * (wheel.values * dt)[:, None], axis=0)
+    fixes = tracked.t_s - point.clock_offset
+    rows = (fixes >= t[0]) & (fixes <= min(t[-1], t[0] + COURSE_S))
+    if rows.sum() < 3:
+        return None
+    fixes, z = fixes[rows], tracked.values[rows]
+    S = np.stack([np.interp(fixes, t, way[:, axis]) for axis in range(3)], axis=1)
+    S = (S + frame.at(fixes) @ (point.arm - odometer.arm)) @ R_level.T
+    return alignment.turn_between(S - S.mean(axis=0), z - z.mean(axis=0), COURSE_SD)
 
 
 def _confirmed_rest(
