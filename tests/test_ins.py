@@ -8,10 +8,15 @@ from numpy.testing import assert_allclose
 
 from tbmfg.filters import ins
 from tbmfg.prepare import prepare
+from tbmfg.rig import override
 from tbmfg.smoother import batch
 from tests.problems import clean_log, drive, flight, flight_problem, log_of, state_errors, true_rig, true_states
 
 NO_LOSS = ("sensors.prism.loss=none", "sensors.magnetometer.loss=none")
+
+
+def rows_of(problem, sensor):
+    return next(rows for rows in problem.rows if rows.sensor == sensor)
 
 
 def sds(cov):
@@ -56,9 +61,14 @@ def test_a_wrong_prior_is_overcome_within_its_sds():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_last_epoch_is_that_of_the_batch_solution(seed):
+@pytest.mark.parametrize("world", ["flight", "drive"])
+def test_last_epoch_is_that_of_the_batch_solution(world, seed):
     """In the linear case they are the same; here they differ by where they linearise, a fraction of a sd."""
-    problem = flight_problem(seed, 20.0, NO_LOSS)
+    if world == "flight":
+        problem = flight_problem(seed, 20.0, NO_LOSS)
+    else:
+        simulation = drive(seed, 20.0, (*NO_LOSS, "sensors.odometer.loss=none"))
+        problem = prepare(log_of(simulation.log_series), simulation.rig)
     filtered = ins.run(problem)
     assert not any(gated.any() for gated in filtered.gated.values())
     smoothed = batch.solve(problem, filtered.x, filtered.c)
@@ -88,6 +98,19 @@ def test_covariances_are_symmetric_and_positive():
     assert np.linalg.eigvalsh(scaled).min() > 0
 
 
+def test_a_displacement_is_measured_from_where_the_last_keyframe_is_now_known_to_be():
+    """The first fix moves the machine by 6 cm, and the keyframe before it as well: no way has been driven."""
+    simulation = drive(0, 20.0, slide=0.0)
+    rig = true_rig(simulation)
+    away = np.add(rig.initial.position, [0.06, -0.03, 0.02]).tolist()
+    problem = prepare(clean_log(simulation), override(rig, [f"initial.position_m={away}"]))
+    assert problem.keyframe_edges[0] not in problem.keyframe_edges[rows_of(problem, "prism").j]
+    found = ins.run(problem)
+    assert not found.gated["odometer"].any()
+    assert found.nis["odometer"].max() < 0.1
+    assert np.linalg.norm(found.x[1, 9:12] - found.x[0, 9:12]) > 0.05
+
+
 def test_parameters_may_be_held():
     problem = flight_problem(0, 20.0)
     held = ins.run(problem, fixed=("arm_x", "arm_y", "arm_z", "declination"))
@@ -110,7 +133,7 @@ def with_prism(problem, change):
 
 
 def prism_of(problem):
-    return next(rows for rows in problem.rows if rows.sensor == "prism")
+    return rows_of(problem, "prism")
 
 
 def test_a_gross_outlier_is_gated_and_does_no_harm():

@@ -15,7 +15,7 @@ from tbmfg.filters import ins
 from tbmfg.inertial.strapdown import correct_states, propagate
 from tbmfg.problem import GATE
 from tbmfg.sensors import Rows
-from tbmfg.smoother import batch, graph, incremental
+from tbmfg.smoother import batch, graph
 from tests.problems import ERRORS, flight_problem, state_errors, worst
 
 LOSSES = ("none", "huber", "cauchy")
@@ -336,20 +336,3 @@ def test_a_drifting_bias_is_followed():
     last = filtered.x[-1, 21] - smoothed.x[-1, 21]
     assert abs(last) < 0.1 * sds(smoothed.cov)[-1, 15]
     assert sds(smoothed.cov)[n // 2, 15] < 0.9 * sds(filtered.cov)[n // 2, 15]
-
-
-# ---- the online smoother ----
-
-
-@pytest.mark.parametrize(("threshold", "bound"), [(1e-3, 0.05), (incremental.RELINEARIZE, 1.0)])
-def test_isam2_ends_where_batch_ends(threshold, bound, monkeypatch):
-    """Same graph, same end, as near as the threshold lets it: what lies within is not linearised anew."""
-    monkeypatch.setattr(incremental, "RELINEARIZE", threshold)
-    problem = flight_problem(2, 12.0, ("sensors.prism.clock_offset_sd_s=0",))
-    online, whole = estimate("isam2", problem), estimate("batch", problem)
-    assert online.smoothed is not None
-    sd = np.sqrt(np.diagonal(whole.trajectory.cov, axis1=1, axis2=2))
-    for name, block in (("position_n", slice(3, 6)), ("velocity_n", slice(6, 9)), ("bias_acc", slice(9, 12))):
-        difference = getattr(online.smoothed, name) - getattr(whole.trajectory, name)
-        assert np.abs(difference / sd[:, block]).max() < bound, name
-    assert_allclose(np.sqrt(np.diagonal(online.smoothed.cov, axis1=1, axis2=2)) / sd, 1.0, atol=0.02)
