@@ -30,8 +30,13 @@ def smoothed(problem):
     return batch.solve(problem, filtered.x, filtered.c)
 
 
-def test_isam2_ends_where_batch_does(problem, smoothed, monkeypatch):
-    monkeypatch.setattr(incremental, "RELINEARIZE", 1e-4)  # its sds here are a millimetre and a tenth of a milliradian
+@pytest.fixture(autouse=True)
+def fine(monkeypatch):
+    """The sds here are a millimetre and a tenth of a milliradian: linearise anew from far below the default on."""
+    monkeypatch.setattr(incremental, "RELINEARIZE", 1e-4)
+
+
+def test_isam2_ends_where_batch_does(problem, smoothed):
     online = incremental.run(problem, None)
     assert online.reanchored == []
     # 5 % of an sd: what iSAM2 leaves where it is until it moves by RELINEARIZE

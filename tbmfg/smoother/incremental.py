@@ -17,7 +17,7 @@ from tbmfg.problem import Problem
 from tbmfg.smoother.factors import Factors, Step, read_state, to_our_chart
 from tbmfg.timeseries import Floats
 
-RELINEARIZE = 1e-3  # change of any variable, in its own unit, from which it is linearised anew
+RELINEARIZE = 1e-2  # change of any variable, in its own unit, from which it is linearised anew
 SETTLE_UPDATES = 10  # iterations after the last keyframe
 REANCHOR_INFLATION = 4.0  # of the covariance that a failed solver is started again from
 
