@@ -309,3 +309,10 @@ def test_an_imu_away_from_its_own_origin_is_refused():
     simulation = flight(0, 10.0)
     with pytest.raises(RigError, match=r"T_bi\.xyz_m"):
         prepared(simulation, "sensors.imu.T_bi.xyz_m=[0.1, 0, 0]")
+
+
+def test_what_no_estimator_does_yet_is_said():
+    simulation = flight(0, 6.0)
+    point = "survey=[{at: end, position_m: [0, 0, 0], sigma_m: 0.01}]"
+    problem = prepare(log_of(simulation.log_series), override(simulation.rig, [point]))
+    assert any("survey" in line and "not used" in line for line in problem.warnings)

@@ -99,7 +99,7 @@ def _coarse_offset(setup: Setup, name: str) -> float:
 
 def _noise_scale(setup: Setup, offsets: dict[str, float], split: Floats, start: float) -> tuple[float, float]:
     """Scale on ``split`` that minimises the cost of ``ins`` (-2 log likelihood), and its sd from the curvature in
-    the logarithm; at least what the data sheet says, at most what the spectrum allows."""
+    the logarithm; a weak prior draws it to what the spectrum says."""
     costs: dict[float, float] = {}
 
     def cost(log2: float) -> float:
