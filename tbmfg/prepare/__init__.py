@@ -21,8 +21,6 @@ from tbmfg.rig import Rig
 from tbmfg.state import Interval
 from tbmfg.timeseries import Log
 
-Prepared = Problem
-
 
 def prepare(
     log: Log,

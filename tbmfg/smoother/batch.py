@@ -11,7 +11,7 @@ from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states
 from tbmfg.problem import Problem
 from tbmfg.smoother import graph
-from tbmfg.smoother.chain import Block, Elimination, eliminate
+from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
 from tbmfg.smoother.graph import States
 from tbmfg.timeseries import Floats
 
@@ -105,12 +105,8 @@ def _damping(blocks: list[Block], damping: float, n: int, d: int, m: int) -> lis
     """Levenberg-Marquardt rows sqrt(damping x diagonal of the information) dx = 0; Nocedal & Wright (2006) ch. 10.3."""
     if damping == 0.0:
         return []
-    diagonal = np.zeros((n, d))
-    for block in blocks:
-        np.add.at(diagonal, block.i, np.sum(block.A_i**2, axis=1))
-        if block.A_j is not None:
-            np.add.at(diagonal, block.i + 1, np.sum(block.A_j**2, axis=1))
-    A = np.sqrt(damping * diagonal)[:, :, None] * np.eye(d)
+    column_lengths, _ = lengths(blocks, n, d, m)
+    A = np.sqrt(damping) * column_lengths[:, :, None] * np.eye(d)
     return [Block(np.arange(n), A, None, np.zeros((n, d, m)), np.zeros((n, d)))]
 
 

@@ -209,10 +209,10 @@ def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
     """Eliminate n keyframes of dimension d with a border of m constants; blocks in any order."""
     U, u_start, B, b_start = assemble(blocks, n, d, m)
     conditionals, border = _eliminate(U, u_start, B, b_start, n, d, m)
-    return Elimination(conditionals, border, *_lengths(blocks, n, d, m), n, d, m)
+    return Elimination(conditionals, border, *lengths(blocks, n, d, m), n, d, m)
 
 
-def _lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:
+def lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:
     """Length of every column, keyframes (n, d) and constants (m,)."""
     squares, border = np.zeros((n, d)), np.zeros(m)
     for block in blocks:
