@@ -6,7 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from tbmfg.errors import EstimationError, TbmfgError
+from tbmfg.errors import EstimationError, RigError, TbmfgError
+from tbmfg.fields import Node, near
+from tbmfg.rig import Rig, switches
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
@@ -20,12 +22,14 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """``run`` loads what it needs when called; ``needs`` lists the sensor kinds it cannot do without."""
+    """``run`` loads what it needs when called; ``needs`` lists the sensor kinds it cannot do without; ``switches``
+    loads the model of what the rig may set under ``estimators``."""
 
     run: Callable[[Problem, Progress], Result]
     summary: str
     needs: tuple[str, ...]
     source: str
+    switches: Callable[[], type[Node]] = lambda: Node
 
 
 def ins(problem: Problem, progress: Progress) -> Result:
@@ -132,6 +136,14 @@ def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], No
                 "gated; do not trust it before the rig's entry for this sensor is checked"
             )
     return result
+
+
+def check_switches(rig: Rig) -> None:
+    """Raise RigError for an entry under the rig's ``estimators`` that no estimator knows."""
+    for name in rig.estimators:
+        if name not in ESTIMATORS:
+            raise RigError(f"{rig.name}: estimators.{name}: no such estimator{near(name, ESTIMATORS)}")
+        switches(rig, name, ESTIMATORS[name].switches())
 
 
 def _refuse_nonsense(problem: Problem, result: Result) -> None:

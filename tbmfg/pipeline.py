@@ -100,12 +100,14 @@ def open_session(
     progress: Progress | None = None,
 ) -> Session:
     """Read and prepare a log; the arguments are those of :func:`run`."""
+    from tbmfg.estimators import check_switches
     from tbmfg.mcap import read_log
     from tbmfg.prepare import prepare
 
     started = time.perf_counter()
     log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
     rig, assumed = rig_for(log, rig, overrides)
+    check_switches(rig)
     dropped = dropped_sensors(rig, without, only)
     reference = find_truth(truth, log, rig)
     try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.steps import Steps, to_ns
+from tbmfg.measure import Samples
 from tbmfg.rig import Rig
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV, Calibrated, Counts, Interval
@@ -91,7 +92,8 @@ class Problem:
 
     ``keyframe_edges`` (n,) are the IMU edges at which the keyframes lie.
     ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
-    ``clock_offset_s`` the offsets that the rows were placed with.
+    ``clock_offset_s`` the offsets that the rows were placed with; ``samples`` what the rows were made of, by sensor,
+    for filters that take every sample when it comes.
     """
 
     rig: Rig
@@ -104,6 +106,7 @@ class Problem:
     prior: Prior
     origin_n: Floats
     clock_offset_s: dict[str, float]
+    samples: dict[str, Samples] = field(default_factory=dict)
     counts: dict[str, Counts] = field(default_factory=dict)
     calibration: dict[str, Calibrated] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)

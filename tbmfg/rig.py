@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from importlib import resources
 from inspect import isclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, field_validator, model_validator
@@ -462,6 +462,8 @@ class Rig(Node):
 
 # ---- reading ----
 
+Switches = TypeVar("Switches", bound=Node)
+
 
 def shipped() -> list[str]:
     """Names of the rigs that come with tbmfg."""
@@ -515,6 +517,16 @@ def override(rig: Rig, assignments: Iterable[str]) -> Rig:
         return (next(touching, rig.name),)
 
     return _validated(data, where)
+
+
+def switches(rig: Rig, estimator: str, model: type[Switches]) -> Switches:
+    """The rig's switches of one estimator, ``estimators.NAME`` in the file, as its model. Raises RigError for keys and
+    values that the estimator does not know."""
+    try:
+        return model.model_validate(rig.estimators.get(estimator, {}))
+    except ValidationError as error:
+        faults = [explain(e, lambda path: model.model_fields) for e in error.errors(include_url=False)]
+    raise RigError("\n".join(f"{rig.name}: estimators.{estimator}.{reason}" for reason in faults))
 
 
 def _assign(data: Any, path: tuple[str, ...], value: Any, source: str) -> KeyPath:

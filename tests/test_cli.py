@@ -77,6 +77,7 @@ def toy(monkeypatch):
     names = {"batch": entry, "fixed-lag": entry}
     fakes = SimpleNamespace(ESTIMATORS=names, estimate=lambda *args, **options: calls.estimate(*args, **options))
     calls.estimate = toy_estimate
+    fakes.check_switches = lambda rig: None
     monkeypatch.setitem(sys.modules, "tbmfg.estimators", fakes)
     monkeypatch.setitem(sys.modules, "tbmfg.prepare", SimpleNamespace(prepare=prepare))
     monkeypatch.setattr("tbmfg.mcap.read_log", read_log)

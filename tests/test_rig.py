@@ -306,3 +306,14 @@ def test_every_field_is_described():
             assert model.__doc__
             undescribed = [name for name, field in model.model_fields.items() if not field.description]
             assert undescribed == [], model.__name__
+
+
+def test_switches_of_an_estimator_are_checked_when_the_rig_is_used():
+    from tbmfg.estimators import check_switches
+
+    rig = parse_rig(MINIMAL, "rig.yaml")
+    check_switches(rig)
+    with pytest.raises(RigError, match=r"estimators\.bacth: no such estimator; did you mean batch\?"):
+        check_switches(override(rig, ["estimators.bacth.speed=1"]))
+    with pytest.raises(RigError, match=r"estimators\.batch\.speed: unknown key"):
+        check_switches(override(rig, ["estimators.batch.speed=1"]))

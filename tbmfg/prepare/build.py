@@ -71,7 +71,7 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
     prior = prior_of(setup, x, np.array(drift_sd), bool(fixes))
     return Problem(
         rig, inertial, edges, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
-        dict(offsets), setup.counts, {}, [], setup.warnings,
+        dict(offsets), samples, setup.counts, {}, [], setup.warnings,
     )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ VALUES = {  # column of the series that each kind of sensor measures with
     "odometer": lambda series: series["linear"][:, 0],
     "magnetometer": lambda series: series["field"],
     "barometer": lambda series: pressure_height(series["pressure"]),
+    "laser": lambda series: series["point"][:, :2],
 }
 ALONE = (
     "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer or barometer as well, "
