@@ -261,6 +261,10 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
     ]
     sensors = [(name, *(str(counts[part]) for part in counted)) for name, counts in summary["sensors"].items()]
     _print_table(["sensor", *counted], sensors, justify="right")
+    if deviation := summary.get("deviation"):
+        spent = ", ".join(f"{level} {duration:.1f} s" for level, duration in deviation["level_s"].items())
+        last = deviation["timeline"][-1]
+        typer.echo(f"deviation: {spent}; at the end {last['direction']}, {last['level']}")
     for key in ("metrics", "metrics_smoothed"):
         metrics = summary.get(key) or {}
         known = [(name, _number(value)) for name, value in metrics.items() if value is not None]

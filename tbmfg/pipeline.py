@@ -76,6 +76,7 @@ class Session:
             "realtime_factor": span_ns / NS / wall_s,
             "peak_rss_mb": peak_rss_mb(),
             **summarise(result, self.prepared.t0_ns),
+            **self._deviation(result),
             "metrics": None,
         }
         if self.reference is not None:
@@ -86,6 +87,17 @@ class Session:
             if result.smoothed is not None:
                 summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
         return result, summary
+
+    def _deviation(self, result: Result) -> dict[str, Any]:
+        """What the dual-coordinate method says of a machine with a laser, {"deviation": ...}; nothing for others."""
+        lasers = self.prepared.rig.of_kind("laser")
+        name = next((name for name in lasers if name in self.prepared.samples), None)
+        if name is None:
+            return {}
+        from tbmfg.dual import timeline
+
+        spots, rule = self.prepared.samples[name], self.prepared.rig.deviation
+        return {"deviation": timeline(result.trajectory, spots, lasers[name], rule, self.prepared.t0_ns)}
 
 
 def open_session(

@@ -348,6 +348,29 @@ class Motion(Node):
     speed = si("speed_mps")
 
 
+class Deviation(Node):
+    """What counts as no deviation of a shaft machine, which a laser's spot and the angles tell together. The bands
+    should be wider than the estimate's noise: a yaw outside its own always means stop."""
+
+    reference_deg: Number = Field(
+        0.0,
+        description="Direction of the shaft's reference in n, counter-clockwise from n's x axis; yaw counts from it.",
+    )
+    angle_tolerance_deg: Positive = Field(0.2, description="Roll and pitch within this are zero.")
+    yaw_tolerance_deg: Positive = Field(0.2, description="Yaw within this is zero.")
+    spot_tolerance_mm: Positive = Field(1.0, description="A spot coordinate within this is zero.")
+    release: Annotated[Number, Field(gt=0, le=1)] = Field(
+        0.7, description="A deviation is over below this share of its tolerance; 1: no hysteresis."
+    )
+    window_s: NotNegative = Field(2.0, description="Of the running median; a change of less than half of it is noise.")
+
+    reference = si("reference_deg", DEG)
+    angle_tolerance = si("angle_tolerance_deg", DEG)
+    yaw_tolerance = si("yaw_tolerance_deg", DEG)
+    spot_tolerance = si("spot_tolerance_mm", MM)
+    window = si("window_s")
+
+
 class TruthTopic(Node):
     """Where the log holds reference poses. They are compared with, never used."""
 
@@ -384,6 +407,7 @@ class Rig(Node):
     )
     zero_velocity: ZeroVelocity = Field(ZeroVelocity(), description="Use of standstill.")
     motion: Motion | None = Field(None, description="Bound on the motion; null: none.")
+    deviation: Deviation = Field(Deviation(), description="Bands of the deviation that a laser shows.")
     truth: TruthTopic | None = Field(None, description="Reference in the log; null: none named.")
     survey: tuple[SurveyPoint, ...] = Field((), description="Surveyed positions.")
     estimators: dict[str, dict[str, Any]] = Field({}, description="Switches of single estimators, by their name.")

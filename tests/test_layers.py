@@ -17,7 +17,7 @@ LEVELS = (
     ("state", "rig"),
     ("sensors", "mcap", "inertial", "lidar", "evaluation"),
     ("measure", "gnss", "results"),
-    ("problem", "inference"),
+    ("problem", "inference", "dual"),
     ("filters", "smoother", "diagnosis"),
     ("outcome",),
     ("prepare",),
