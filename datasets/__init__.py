@@ -9,6 +9,7 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``simulate``  the place on Earth, means over sampling periods, the rig whose priors everything is drawn from
 - ``sensors``   ideal sensors on a motion, and their noise
 - ``tbm``       a machine: how it moves, how it shakes, what it carries; ``tbm_static``: the same standing still
+- ``shaft``     a shaft boring machine, standing, cutting, turning, sinking; ``cage``: its unit on a cage in the shaft
 - ``recordings``  what was really measured, from the npz it is packaged in
 """
 
@@ -27,10 +28,18 @@ if TYPE_CHECKING:
     from datasets.recordings import Recording
     from datasets.simulate import Simulation
 
-# Each module has ``rig()``, the rig whose priors it draws from, and ``make(rig, *, seed, duration, **options)``.
+# Each is a function ``make(rig, *, seed, duration, **options)`` whose default duration is the dataset's own length, in
+# a module that has ``rig()``, the rig whose priors it draws from.
 MACHINES = {
-    "tbm-drive": "datasets.tbm",
-    "tbm-static": "datasets.tbm_static",
+    "tbm-drive": "datasets.tbm:make",
+    "tbm-static": "datasets.tbm_static:make",
+    "shaft-static": "datasets.shaft:static",
+    "shaft-low": "datasets.shaft:low",
+    "shaft-high": "datasets.shaft:high",
+    "shaft-dynamic": "datasets.shaft:dynamic",
+    "shaft-descend": "datasets.shaft:descend",
+    "cage-fast": "datasets.cage:fast",
+    "cage-slow": "datasets.cage:slow",
 }
 
 # Each module has ``load(source, **options)``.
@@ -48,22 +57,23 @@ def make(
     name: str,
     *,
     seed: int = 0,
-    duration: float = 120.0,
+    duration: float | None = None,
     rig: Rig | None = None,
     settings: tuple[str, ...] = (),
     **options: Any,
 ) -> Simulation:
-    """Simulate ``name`` for ``duration`` s.
+    """Simulate ``name`` for ``duration`` s, or for its own length.
 
     ``rig`` replaces the machine's own, ``settings`` (``sensors.prism.sigma_mm=2``) change single values of it.
     """
     if name not in MACHINES:
         raise TbmfgError(f"{name}: no such dataset; there are {', '.join(MACHINES)}")
-    if duration <= 0:
+    duration = own_duration(name) if duration is None else duration
+    if not duration > 0:
         raise TbmfgError(f"{name}: a duration of {duration:g} s; it should be above 0")
-    module = module_of(name)
     _refuse_unknown(name, options)
-    return module.make(override(rig or module.rig(), settings), seed=seed, duration=duration, **options)
+    machine = override(rig or _module(MACHINES[name]).rig(), settings)
+    return function(name)(machine, seed=seed, duration=duration, **options)
 
 
 def load(name: str, source: str | Path, *, settings: tuple[str, ...] = (), **options: Any) -> Recording:
@@ -71,7 +81,7 @@ def load(name: str, source: str | Path, *, settings: tuple[str, ...] = (), **opt
     if name not in RECORDINGS:
         raise TbmfgError(f"{name}: no such recording; there are {', '.join(RECORDINGS)}")
     _refuse_unknown(name, options)
-    recording = module_of(name).load(source, **options)
+    recording = function(name)(source, **options)
     return replace(recording, rig=override(recording.rig, settings))
 
 
@@ -83,11 +93,30 @@ def _refuse_unknown(name: str, options: dict[str, Any]) -> None:
 
 def defaults(name: str) -> dict[str, Any]:
     """The options of one dataset and their defaults."""
-    function = module_of(name).load if name in RECORDINGS else module_of(name).make
-    parameters = inspect.signature(function).parameters.values()
-    return {parameter.name: parameter.default for parameter in parameters if parameter.default is not parameter.empty}
+    given = {parameter.name: parameter.default for parameter in _parameters(name)}
+    return {key: value for key, value in given.items() if value is not inspect.Parameter.empty and key != "duration"}
 
 
-def module_of(name: str) -> Any:
-    """The module of a simulated or recorded dataset."""
-    return importlib.import_module({**MACHINES, **RECORDINGS}[name])
+def own_duration(name: str) -> float:
+    """How long a simulated dataset is where nothing else is asked, s."""
+    return next(parameter.default for parameter in _parameters(name) if parameter.name == "duration")
+
+
+def summary(name: str) -> str:
+    """What a dataset is, in one line."""
+    told = function(name) if name in MACHINES else _module(RECORDINGS[name])
+    return (told.__doc__ or "").partition("\n")[0]
+
+
+def function(name: str) -> Any:
+    """What makes or loads a dataset."""
+    place = MACHINES.get(name) or f"{RECORDINGS[name]}:load"
+    return getattr(_module(place), place.partition(":")[2])
+
+
+def _module(place: str) -> Any:
+    return importlib.import_module(place.partition(":")[0])
+
+
+def _parameters(name: str) -> list[inspect.Parameter]:
+    return list(inspect.signature(function(name)).parameters.values())

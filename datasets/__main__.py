@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from datasets import MACHINES, RECORDINGS, defaults, load, make, module_of
+from datasets import MACHINES, RECORDINGS, defaults, load, make, own_duration, summary
 from tbmfg.errors import TbmfgError
 
 
@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     maker.add_argument("name", metavar="NAME", help="as in the list")
     maker.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .mcap to write")
     maker.add_argument("--seed", type=int, default=0, help="of every draw (default 0)")
-    maker.add_argument("--duration", type=float, default=120.0, metavar="S", help="seconds (default 120)")
+    maker.add_argument("--duration", type=float, metavar="S", help="seconds (default: as in the list)")
     importer = commands.add_parser("import", help="write a public recording as MCAP, a rig attached")
     importer.add_argument("name", metavar="NAME", help="as in the list")
     importer.add_argument("source", type=Path, metavar="SRC", help="its npz, or the folder that holds it")
@@ -54,11 +54,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def describe(name: str) -> str:
-    """One dataset in two lines: what it is, and its options."""
-    summary = (module_of(name).__doc__ or "").partition("\n")[0]
-    kind = "make" if name in MACHINES else "import"
+    """One dataset in two lines: what it is, how long if it is simulated, and its options."""
+    kind, length = ("make", f" {own_duration(name):g} s.") if name in MACHINES else ("import", "")
     options = " ".join(f"{key}={_written(value)}" for key, value in defaults(name).items())
-    return f"{kind} {name}  {summary}" + f"\n    {options}" * bool(options)
+    return f"{kind} {name}  {summary(name)}{length}" + f"\n    {options}" * bool(options)
 
 
 def sort(name: str, assignments: list[str]) -> tuple[tuple[str, ...], dict[str, Any]]:

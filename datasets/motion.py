@@ -109,6 +109,17 @@ class Motion:
         return compose(motion, rigid(*(sum(parts) for parts in zip(*shaking, strict=True))))
 
 
+def smooth_step(x: Floats) -> Floats:
+    """0 below 0, 1 above 1, three continuous derivatives."""
+    x = np.clip(x, 0.0, 1.0)
+    return x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)
+
+
+def integral(t_s: Floats, values: Floats) -> Floats:
+    """Integral of ``values`` (n,) from the first of ``t_s`` on, by the quintic spline through them."""
+    return make_interp_spline(t_s, values, k=5).antiderivative()(t_s)
+
+
 def rotate(R: Floats, v: Floats) -> Floats:
     """R v row by row, (n, 3, 3) and (n, 3) -> (n, 3)."""
     return np.einsum("nij,nj->ni", R, v)

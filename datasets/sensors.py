@@ -7,11 +7,18 @@ the rig's prior. A sensor is a function of the scene, its part of the rig and it
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr
 
-from datasets.motion import rotate_back
+from datasets.motion import Kinematics, rotate_back
 from datasets.simulate import START_NS, Scene, Sensed, period_means, ticks
-from tbmfg.rig import Imu, Magnetometer, Odometer, Prism
+from tbmfg.rig import Barometer, Imu, Laser, Magnetometer, Odometer, Prism
 from tbmfg.timeseries import NS, Floats, Series
+
+DRIVE_HZ = 48.6  # an inverter a little below the mains; read 50 times a second, its field beats at 1.4 Hz
+LOAD_HZ = 0.05  # of a motor's load
+AIR_K = 295.15  # what a thermometer in the shaft says
+AIR_GAS = 287.05  # of dry air, J/kg/K
+WARMING = 9.8e-3  # of air that sinks without heat, K/m
 
 
 def imu(scene: Scene, sensor: Imu, rng: np.random.Generator, *, rate_hz: float) -> Sensed:
@@ -109,8 +116,15 @@ def magnetometer(
     rate_hz: float,
     field_t: float = 50e-6,
     dip_deg: float = 65.0,
+    noise_t: float | None = None,
+    motor_t: float = 0.0,
 ) -> Sensed:
-    """The Earth's field, T, with white noise on every axis that gives the horizontal direction the rig's sigma."""
+    """The Earth's field, T, and that of an electric motor on the machine.
+
+    The noise is white on every axis, ``noise_t`` or what gives the horizontal direction the rig's sigma. The motor's
+    field alternates along a direction of the body drawn anew, between half and one and a half times ``motor_t`` with
+    the load; sampled, it beats at a few hertz.
+    """
     t_ns = ticks(scene.duration_s, rate_hz)
     declination_deg = sensor.declination_deg + sensor.declination_sd_deg * rng.standard_normal()
     north, up = scene.north_up_n
@@ -119,11 +133,120 @@ def magnetometer(
     field_n = field_t * (np.cos(dip) * magnetic_north - np.sin(dip) * up)
     # in b first, then in the sensor's axes; the machine's own field is fixed in the latter
     clean = field_n @ scene.motion(t_ns * 1e-9).R @ sensor.R_bm + 1e-6 * np.array(sensor.hard_iron_ut)
-    sigma = np.radians(sensor.sigma_deg) * field_t * np.cos(dip)
+    sigma = np.radians(sensor.sigma_deg) * field_t * np.cos(dip) if noise_t is None else noise_t
+    white = rng.standard_normal(clean.shape)
+    axis, phase = rng.standard_normal(3), 2 * np.pi * rng.random(2)
+    load = 1 + 0.5 * np.sin(2 * np.pi * LOAD_HZ * t_ns * 1e-9 + phase[0])
+    motor = motor_t * load * np.cos(2 * np.pi * DRIVE_HZ * t_ns * 1e-9 + phase[1])
 
     def series(offset_s: float, values: Floats) -> Series:
         stamps = START_NS + t_ns + round(offset_s * NS)
         return Series(sensor.topic, "sensor_msgs/msg/MagneticField", stamps, {"field": values}, "imu")
 
-    measured = clean + sigma * rng.standard_normal(clean.shape)
+    measured = clean + sigma * white + motor[:, None] * axis / np.linalg.norm(axis) @ sensor.R_bm
     return Sensed(series(sensor.clock_offset_s, measured), series(0.0, clean), {"declination_deg": declination_deg})
+
+
+def barometer(
+    scene: Scene,
+    sensor: Barometer,
+    rng: np.random.Generator,
+    *,
+    rate_hz: float,
+    update_hz: float,
+    noise_pa: float | None,
+    drift_pa_per_h: float,
+    air_sd_k: float,
+) -> Sensed:
+    """Air pressure, Pa, in a shaft whose air is not as warm as its thermometer says: ``air_k`` of ``drawn``.
+
+    The unit converts ``update_hz`` times a second and is read ``rate_hz`` times. ``drift_pa_per_h`` is the sd of the
+    weather's trend. Without ``noise_pa`` every error is the rig's: each reading is fresh, its noise white, its drift
+    a random walk.
+    """
+    t_ns = ticks(scene.duration_s, rate_hz)
+    depth = -scene.motion(t_ns * 1e-9).position[:, 2]
+    warmth, weather, trend = rng.standard_normal(3)
+    white, steps = rng.standard_normal((len(t_ns), 2)).T
+    air_k = AIR_K + air_sd_k * warmth
+    middle_m = (depth.min() + depth.max()) / 2
+    gravity = -scene.gravity_n[2]
+    per_metre = 101325.0 * gravity / (AIR_GAS * AIR_K)
+    collar_pa = 101325.0 + per_metre * sensor.bias_sd_m * weather
+
+    def series(offset_s: float, pascals: Floats) -> Series:
+        stamps = START_NS + t_ns + round(offset_s * NS)
+        return Series(sensor.topic, "sensor_msgs/msg/FluidPressure", stamps, {"pressure": pascals}, "barometer")
+
+    clean = shaft_pressure(depth, collar_pa, air_k, middle_m, gravity)
+    if noise_pa is None:
+        walk = sensor.bias_walk / np.sqrt(rate_hz) * np.cumsum(steps)
+        error_m = sensor.sigma_m * white + walk
+        measured, offset_s = clean + per_metre * error_m, sensor.clock_offset_s
+    else:
+        converted = np.floor(np.arange(len(t_ns)) * update_hz / rate_hz + 1e-9).astype(int)
+        t_s = converted / update_hz
+        then = -scene.motion(t_s).position[:, 2]
+        drift = drift_pa_per_h / 3600 * trend * t_s
+        measured, offset_s = (
+            shaft_pressure(then, collar_pa, air_k, middle_m, gravity) + drift + noise_pa * white[converted],
+            0.0,
+        )
+    drawn = {"air_k": air_k, "collar_pa": collar_pa}
+    return Sensed(series(offset_s, measured), series(0.0, clean), drawn)
+
+
+def shaft_pressure(depth: Floats, collar_pa: float, air_k: float, middle_m: float, gravity: float) -> Floats:
+    """Pressure, Pa, at ``depth`` (n,) m in a column of dry air, ``air_k`` warm at ``middle_m``.
+
+    Hydrostatics, dp = p g / (R T) dh, in air that warms by WARMING on its way down.
+    """
+    warmth = air_k + WARMING * (depth - middle_m)
+    at_collar = air_k - WARMING * middle_m
+    return collar_pa * (warmth / at_collar) ** (gravity / (AIR_GAS * WARMING))
+
+
+def laser(
+    scene: Scene,
+    sensor: Laser,
+    rng: np.random.Generator,
+    *,
+    rate_hz: float,
+    tilt_sd_deg: float,
+    dropout: float,
+    resolution_m: float = 0.02e-3,
+    half_width_m: float = 0.03,
+) -> Sensed:
+    """The spot of a plumb laser on a detector, x and y in its axes, m: where line and tilted plane meet.
+
+    The line goes through n's origin, out of plumb by ``tilt_n`` of ``drawn``, m/m in n's x and y. The spot jitters
+    with the rig's sigma, is read in steps and no farther out than the detector is wide; dust hides a share
+    ``dropout`` of the readings, which then are not sent.
+    """
+    t_ns = ticks(scene.duration_s, rate_hz)
+    truth = scene.motion(t_ns * 1e-9)
+    tilt = np.radians(tilt_sd_deg) * rng.standard_normal(2)
+    *white, dust = rng.standard_normal((len(t_ns), 3)).T
+    spot = spot_on_detector(truth, np.array(sensor.T_bd.xyz_m), sensor.T_bd.R, np.append(tilt, 1.0))
+    noisy = spot + 1e-3 * sensor.sigma_mm * np.column_stack(white)
+    read = np.clip(resolution_m * np.round(noisy / resolution_m), -half_width_m, half_width_m)
+    seen = ndtr(dust) >= dropout
+
+    def series(rows: np.ndarray, xy: Floats) -> Series:
+        points = np.pad(xy[rows], ((0, 0), (0, 1)))
+        return Series(
+            sensor.topic, "geometry_msgs/msg/PointStamped", START_NS + t_ns[rows], {"point": points}, "detector"
+        )
+
+    return Sensed(series(seen, read), series(np.ones_like(seen), spot), {"tilt_n": tilt})
+
+
+def spot_on_detector(truth: Kinematics, xyz_b: Floats, R_bd: Floats, along_n: Floats) -> Floats:
+    """Where the line through n's origin along ``along_n`` (3,) meets the detector's plane, (n, 2) in its axes.
+
+    Three equations, three unknowns: origin + R (x, y, 0) = s along.
+    """
+    origin_n, _ = truth.at_point(xyz_b)
+    R_nd = truth.R @ R_bd
+    unknowns = np.concatenate([R_nd[:, :, :2], np.broadcast_to(-along_n, origin_n.shape)[:, :, None]], axis=2)
+    return np.linalg.solve(unknowns, -origin_n[:, :, None])[:, :2, 0]

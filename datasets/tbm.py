@@ -21,9 +21,8 @@ from functools import partial
 from itertools import cycle
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
-from datasets.motion import Lines, Motion, Spline, lines, rigid, rotate
+from datasets.motion import Lines, Motion, Spline, integral, lines, rigid, rotate, smooth_step
 from datasets.sensors import imu, magnetometer, odometer, prism
 from datasets.simulate import Simulation, simulate, stream
 from tbmfg.errors import RigError
@@ -76,7 +75,7 @@ def make(
     machine: Rig,
     *,
     seed: int,
-    duration: float,
+    duration: float = 120.0,
     vibration: float = 1.0,
     slide: float = 0.0,
     imu_rate_hz: float = 475.0,
@@ -86,10 +85,11 @@ def make(
     magnetometer_rate_hz: float = 20.0,
     truth_rate_hz: float | None = None,
 ) -> Simulation:
-    """The drive, ``duration`` s long; ``prism_gaps`` is how often dust hides the prism for seconds.
+    """A roadheader in a roadway, tracked by a total station.
 
-    Truth is written at the IMU's stamps unless ``truth_rate_hz`` says otherwise: interpolated over a vibration of
-    24.5 Hz and more, a slower one errs by more than the estimates.
+    ``prism_gaps`` is how often dust hides the prism for seconds. Truth is written at the IMU's stamps unless
+    ``truth_rate_hz`` says otherwise: interpolated over a vibration of 24.5 Hz and more, a slower one errs by more
+    than the estimates.
     """
     sensors = {
         "imu": partial(imu, rate_hz=imu_rate_hz),
@@ -206,14 +206,3 @@ def shaking(plan: Plan, vibration: float, rng: np.random.Generator) -> tuple[Lin
         rng=rng,
     )
     return pump, crawler
-
-
-def smooth_step(x: Floats) -> Floats:
-    """0 below 0, 1 above 1, three continuous derivatives."""
-    x = np.clip(x, 0.0, 1.0)
-    return x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3)
-
-
-def integral(t_s: Floats, values: Floats) -> Floats:
-    """Integral of ``values`` (n,) from the first of ``t_s`` on, by the quintic spline through them."""
-    return make_interp_spline(t_s, values, k=5).antiderivative()(t_s)

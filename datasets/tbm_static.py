@@ -27,9 +27,9 @@ def rig() -> Rig:
 
 
 def make(
-    machine: Rig, *, seed: int, duration: float, imu_rate_hz: float = 475.0, prism_rate_hz: float = 5.0
+    machine: Rig, *, seed: int, duration: float = 120.0, imu_rate_hz: float = 475.0, prism_rate_hz: float = 5.0
 ) -> Simulation:
-    """``duration`` s of standing."""
+    """The same roadheader standing still, its heading unknown."""
     travel = tbm.path(tbm.Plan.standing(duration), CONTACT_B, 0.0, stream(seed, "slide"))
     return simulate(
         "tbm-static",
