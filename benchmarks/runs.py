@@ -88,7 +88,7 @@ def run(job: Job) -> list[Measured]:
 def in_memory(simulation: Simulation) -> Log:
     """The simulated log as the reader would give it."""
     series = {s.topic: replace(s, counts=StreamCounts(received=len(s))) for s in simulation.log_series}
-    return Log(simulation.name, series)
+    return Log(simulation.name, series, {clouds.topic: clouds for clouds in simulation.clouds})
 
 
 def measure(job: Job, simulation: Simulation, problem: Problem, result: Result) -> Measured:

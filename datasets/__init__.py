@@ -10,6 +10,7 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``sensors``   ideal sensors on a motion, and their noise
 - ``tbm``       a machine: how it moves, how it shakes, what it carries; ``tbm_static``: the same standing still
 - ``shaft``     a shaft boring machine, standing, cutting, turning, sinking; ``cage``: its unit on a cage in the shaft
+- ``worlds``, ``lidar``  places underground, and how a LiDAR sees them: ``tbm_tunnel``, ``tbm_roadway``
 - ``recordings``  what was really measured, from the npz it is packaged in
 """
 
@@ -40,6 +41,8 @@ MACHINES = {
     "shaft-descend": "datasets.shaft:descend",
     "cage-fast": "datasets.cage:fast",
     "cage-slow": "datasets.cage:slow",
+    "tbm-tunnel": "datasets.tbm_tunnel:make",
+    "tbm-roadway": "datasets.tbm_roadway:make",
 }
 
 # Each module has ``load(source, **options)``.
@@ -50,6 +53,8 @@ RECORDINGS = {
     "comma": "datasets.recordings.comma",
     "broad": "datasets.recordings.broad",
     "phone": "datasets.recordings.phone",
+    "kitti-lidar": "datasets.recordings.kitti_lidar",
+    "balm-lidar": "datasets.recordings.balm_lidar",
 }
 
 

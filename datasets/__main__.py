@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             log = load(given.name, given.source, settings=settings, **options)
         log.write(given.output)
-        counts = ", ".join(f"{series.topic} {len(series)}" for series in log.log_series)
+        counts = ", ".join(f"{part.topic} {len(part)}" for part in (*log.log_series, *log.clouds))
         print(f"{given.output}: {counts}")
     except (TbmfgError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

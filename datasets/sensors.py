@@ -6,6 +6,8 @@ the rig's prior. A sensor is a function of the scene, its part of the rig and it
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.special import ndtr
 
@@ -56,11 +58,18 @@ def imu(scene: Scene, sensor: Imu, rng: np.random.Generator, *, rate_hz: float) 
 
 
 def prism(
-    scene: Scene, sensor: Prism, rng: np.random.Generator, *, rate_hz: float, jitter_s: float = 0.005, gaps: int = 0
+    scene: Scene,
+    sensor: Prism,
+    rng: np.random.Generator,
+    *,
+    rate_hz: float,
+    jitter_s: float = 0.005,
+    gaps: int = 0,
+    visibility: Callable[[Floats], Floats] | None = None,
 ) -> Sensed:
     """Positions of the prism at instants that jitter about the nominal ones; the stamps know the jitter.
 
-    ``gaps`` interruptions of 2 to 6 s lie anywhere in the log.
+    ``gaps`` interruptions of 2 to 6 s lie anywhere in the log; ``visibility`` is the chance of a fix at times (n,) s.
     """
     arm = sensor.arm + sensor.arm_sd * rng.standard_normal(3)
     offset = sensor.clock_offset + sensor.clock_offset_sd * rng.standard_normal()
@@ -69,6 +78,8 @@ def prism(
     t_s = (np.arange(len(jitter)) + 0.5) / rate_hz + jitter_s * jitter
     hidden = ((t_s[:, None] > gap_start) & (t_s[:, None] < gap_start + gap_length)).any(axis=1)
     seen = ~hidden & (t_s > 0) & (t_s < scene.duration_s)
+    if visibility is not None:
+        seen &= rng.random(len(t_s)) < visibility(t_s)
     t_ns = np.round(t_s[seen] * NS).astype(np.int64)
 
     position, _ = scene.motion(t_ns * 1e-9).at_point(arm)

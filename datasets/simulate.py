@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from datasets.motion import Kinematics, Motion, rotate_back
 from tbmfg.errors import RigError
 from tbmfg.rig import Origin, Rig, dump_rig, kind_of
-from tbmfg.timeseries import NS, Floats, Series, Times
+from tbmfg.timeseries import NS, Clouds, Floats, Series, Times
 
 START_NS = 1_700_000_000 * NS
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -71,8 +71,8 @@ class Sensed:
     lever arms in it are the true ones. ``drawn`` has the names of the rig's fields.
     """
 
-    log: Series
-    clean: Series
+    log: Series | Clouds
+    clean: Series | Clouds
     drawn: dict[str, Any] = field(default_factory=dict)
 
 
@@ -81,15 +81,16 @@ class Simulation:
     """A simulated log and everything that it hides.
 
     ``truth`` maps seconds since ``start_ns`` (n,) to the :class:`Kinematics` of b in n; ``clean`` and
-    ``drawn`` are those of :class:`Sensed` by sensor name.
+    ``drawn`` are those of :class:`Sensed` by sensor name. ``clouds`` are cast when they are iterated over.
     """
 
     name: str
     log_series: tuple[Series, ...]
     rig: Rig
     truth: Callable[[Floats], Kinematics]
-    clean: dict[str, Series]
+    clean: dict[str, Series | Clouds]
     drawn: dict[str, dict[str, Any]]
+    clouds: tuple[Clouds, ...] = ()
     start_ns: int = START_NS
 
     @property
@@ -101,7 +102,7 @@ class Simulation:
         """Write the MCAP log, with its rig attached as ``rig.yaml``."""
         from tbmfg.mcap import write_log
 
-        write_log(path, self.log_series, attachments={"rig.yaml": self.rig_text.encode()})
+        write_log(path, self.log_series, clouds=self.clouds, attachments={"rig.yaml": self.rig_text.encode()})
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -127,13 +128,15 @@ def simulate(
     sensed = {key: sensors[kind_of(key)](scene, sensor, stream(seed, key)) for key, sensor in kept.items()}
     initial = rig.initial.model_copy(update=draw_prior(rig, motion(np.zeros(1)), stream(seed, "initial")))
     truth = [] if rig.truth is None else [odometry(scene, rig.truth.topic, truth_rate_hz)]
+    logs = [part.log for part in sensed.values()]
     return Simulation(
         name=name,
-        log_series=(*(part.log for part in sensed.values()), *truth),
+        log_series=(*(log for log in logs if isinstance(log, Series)), *truth),
         rig=rig.model_copy(update={"sensors": kept, "initial": initial}),
         truth=motion,
         clean={key: part.clean for key, part in sensed.items()},
         drawn={key: part.drawn for key, part in sensed.items()},
+        clouds=tuple(log for log in logs if not isinstance(log, Series)),
     )
 
 

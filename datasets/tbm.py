@@ -156,19 +156,26 @@ class Plan:
         return Plan(t_s, speed, turn_rate, moving, smooth_step((t_s - stand_s * 2 / 3) / RAMP_S))
 
 
-def path(plan: Plan, contact_b: Floats, slide_density: float, rng: np.random.Generator) -> Spline:
+def path(
+    plan: Plan,
+    contact_b: Floats,
+    slide_density: float,
+    rng: np.random.Generator,
+    start: Floats = START,
+    start_yaw_deg: float = START_YAW_DEG,
+) -> Spline:
     """The IMU's undisturbed way (x, y, z, roll, pitch, yaw), the machine standing on ``contact_b`` (3,).
 
     ``slide_density`` is the white noise of the contact point's sideways and upward speed, m/s/sqrt(Hz).
     """
-    yaw = START_YAW_DEG * DEG + integral(plan.t_s, plan.turn_rate)
-    x, y = (START[axis] + integral(plan.t_s, plan.speed * part(yaw)) for axis, part in enumerate((np.cos, np.sin)))
+    yaw = start_yaw_deg * DEG + integral(plan.t_s, plan.turn_rate)
+    x, y = (start[axis] + integral(plan.t_s, plan.speed * part(yaw)) for axis, part in enumerate((np.cos, np.sin)))
     height, slope = floor(np.column_stack([x, y]))
     ahead = slope[:, 0] * np.cos(yaw) + slope[:, 1] * np.sin(yaw)
     left = slope[:, 1] * np.cos(yaw) - slope[:, 0] * np.sin(yaw)
     # x axis along the track, z axis normal to the floor
     pitch, roll = -np.arctan(ahead), np.arctan(left / np.hypot(1, ahead))
-    tracks = np.column_stack([x, y, START[2] + height, roll, pitch, yaw])
+    tracks = np.column_stack([x, y, start[2] + height, roll, pitch, yaw])
     R = rigid(tracks, tracks, tracks).R
     slid = slide_density / np.sqrt(STEP_S) * plan.moving[:, None] * rng.standard_normal((len(plan.t_s), 2))
     tracks[:, :3] += STEP_S * np.cumsum(rotate(R, np.pad(slid, ((0, 0), (1, 0)))), axis=0) - R @ contact_b

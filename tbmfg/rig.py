@@ -304,9 +304,26 @@ class Laser(Sensor):
 
 
 class Lidar(Sensor):
-    """Scanning LiDAR."""
+    """Scanning LiDAR. The defaults suit roadways and halls."""
 
     T_bl: Mounting = Field(Mounting(), description="The LiDAR in b.")
+    T_bl_xyz_sd_m: CalibrationSd = Field(0.0, description="Of T_bl.xyz_m per axis; 0 or null: not estimated.")
+    T_bl_rpy_sd_deg: CalibrationSd = Field(0.0, description="Of T_bl's rotation per axis; 0 or null: not estimated.")
+    clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
+    time_field: Text | None = Field(None, description="Points' own times; null: the field that is usually it.")
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = Field("auto", description="Of the points' own times.")
+    min_range_m: NotNegative = Field(0.5, description="Nearer points are the machine itself.")
+    max_range_m: Positive = Field(100.0, description="Farther points are not used.")
+    voxel_m: Positive = Field(0.5, description="Size of the pieces that surfaces are cut into.")
+    noise_factor: Positive = Field(1.0, description="Multiplies the sds of the odometry.")
+    loss: Loss = Field("huber", description="Weight of outliers in the graph.")
+
+    xyz_sd = si("T_bl_xyz_sd_m")
+    rpy_sd = si("T_bl_rpy_sd_deg", DEG)
+    clock_offset = si("clock_offset_s")
+    min_range = si("min_range_m")
+    max_range = si("max_range_m")
+    voxel = si("voxel_m")
 
 
 KINDS: dict[str, type[Sensor]] = {

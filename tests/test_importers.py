@@ -279,6 +279,26 @@ def test_faults_are_one_line_and_exit_1(tmp_path, capsys):
     assert not (tmp_path / "x.mcap").exists()
 
 
+def test_packed_scans(tmp_path):
+    rng = np.random.default_rng(3)
+    xyz_q, offsets = rng.integers(-9000, 9000, (7, 3)).astype(np.int16), np.array([0, 3, 7])
+    t_s = np.array([0.0, 0.5])
+    turn = Rotation.from_rotvec([[0, 0, 0], [0, 0.1, 0.4]])
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = turn.as_matrix(), [[0, 0, 0], [1, 2, 3]]
+    arrays = {"xyz_q": xyz_q, "offsets": offsets, "scale": 0.002, "intensity": np.arange(7, dtype=np.uint8)}
+    save(tmp_path, **arrays, scan_t=t_s, t0_unix=1.63e9, ref_T=T)
+    log = imported("balm-lidar", tmp_path)
+    scans = list(log.clouds["/points"])
+    assert [t_ns - 1_630_000_000 * NS for t_ns, _ in scans] == [0, NS // 2]
+    assert_allclose(np.column_stack([scans[1][1][axis] for axis in "xyz"]), xyz_q[3:] * 0.002, rtol=1e-6)
+    assert_array_equal(scans[0][1]["intensity"], [0, 1, 2])
+    assert_allclose(log.series["/truth/pose"]["position"], T[:, :3, 3])
+    assert_allclose(log.series["/truth/pose"]["quat_xyzw"], turn.as_quat(), atol=1e-15)
+    assert rig_in(log).sensors["lidar"].topic == "/points"
+    assert len(imported("kitti-lidar", tmp_path).clouds["/points"]) == 2
+
+
 def test_settings_change_the_attached_rig(tmp_path):
     log = imported("euroc", save(tmp_path, **flight()), "sensors.imu.noise_factor=3")
     assert rig_in(log).imu.noise_factor == 3

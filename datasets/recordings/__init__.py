@@ -15,7 +15,7 @@ import numpy as np
 
 from tbmfg.errors import TbmfgError
 from tbmfg.rig import Rig, dump_rig, load_rig
-from tbmfg.timeseries import NS, Floats, Series, Times
+from tbmfg.timeseries import NS, Clouds, Floats, Series, Times
 
 G = 9.80665  # m/s^2 in a g
 
@@ -27,16 +27,18 @@ class Recording:
     log_series: tuple[Series, ...]
     rig: Rig
     log_ns: Mapping[str, Times] = field(default_factory=dict)
+    clouds: tuple[Clouds, ...] = ()
 
     def write(self, path: str | Path) -> None:
-        """Write the MCAP log, its rig attached: without the sensors that this recording does not have."""
+        """Write the MCAP log, its rig attached: without the sensors, but for the IMU, that this recording lacks."""
         from tbmfg.mcap import write_log
 
-        topics = {series.topic for series in self.log_series}
-        sensors = {name: sensor for name, sensor in self.rig.sensors.items() if sensor.topic in topics}
+        topics = {part.topic for part in (*self.log_series, *self.clouds)}
+        kept = {name: sensor for name, sensor in self.rig.sensors.items() if sensor.topic in topics or name == "imu"}
         truth = self.rig.truth if self.rig.truth and self.rig.truth.topic in topics else None
-        rig = self.rig.model_copy(update={"sensors": sensors, "truth": truth})
-        write_log(path, self.log_series, attachments={"rig.yaml": dump_rig(rig).encode()}, log_ns=self.log_ns)
+        rig = self.rig.model_copy(update={"sensors": kept, "truth": truth})
+        attached = {"rig.yaml": dump_rig(rig).encode()}
+        write_log(path, self.log_series, clouds=self.clouds, attachments=attached, log_ns=self.log_ns)
 
 
 class Arrays(dict):
