@@ -9,6 +9,7 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``simulate``  the place on Earth, means over sampling periods, the rig whose priors everything is drawn from
 - ``sensors``   ideal sensors on a motion, and their noise
 - ``tbm``       a machine: how it moves, how it shakes, what it carries; ``tbm_static``: the same standing still
+- ``shearer``   another; ``shearer_magfault``: the same beside steel; ``shearer_panel``: along the face and back
 - ``shaft``     a shaft boring machine, standing, cutting, turning, sinking; ``cage``: its unit on a cage in the shaft
 - ``worlds``, ``lidar``  places underground, and how a LiDAR sees them: ``tbm_tunnel``, ``tbm_roadway``
 - ``recordings``  what was really measured, from the npz it is packaged in
@@ -43,6 +44,9 @@ MACHINES = {
     "cage-slow": "datasets.cage:slow",
     "tbm-tunnel": "datasets.tbm_tunnel:make",
     "tbm-roadway": "datasets.tbm_roadway:make",
+    "shearer-cut": "datasets.shearer:make",
+    "shearer-magfault": "datasets.shearer_magfault:make",
+    "shearer-panel": "datasets.shearer_panel:make",
 }
 
 # Each module has ``load(source, **options)``.

@@ -7,6 +7,7 @@ the rig's prior. A sensor is a function of the scene, its part of the rig and it
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -21,6 +22,9 @@ LOAD_HZ = 0.05  # of a motor's load
 AIR_K = 295.15  # what a thermometer in the shaft says
 AIR_GAS = 287.05  # of dry air, J/kg/K
 WARMING = 9.8e-3  # of air that sinks without heat, K/m
+
+# Times (n,) s, R_nb (n, 3, 3), the Earth's field in n (3,) T -> what is added to it in n, (n, 3) T, and what was drawn.
+Disturbance = Callable[[Floats, Floats, Floats], tuple[Floats, dict[str, Any]]]
 
 
 def imu(scene: Scene, sensor: Imu, rng: np.random.Generator, *, rate_hz: float) -> Sensed:
@@ -94,11 +98,21 @@ def prism(
     return Sensed(series(offset, measured), series(0.0, position), {"arm_m": arm, "clock_offset_s": offset})
 
 
-def odometer(scene: Scene, sensor: Odometer, rng: np.random.Generator, *, rate_hz: float) -> Sensed:
+def odometer(
+    scene: Scene,
+    sensor: Odometer,
+    rng: np.random.Generator,
+    *,
+    rate_hz: float,
+    tick_m: float = 0.0,
+    slips: int = 0,
+) -> Sensed:
     """Mean forward speed of the contact point over each period, stamped at its end.
 
     The tracks roll with the undisturbed machine: an odometer does not feel the body's vibration. The forward axis
-    is b's x axis; its other components are not measured and given as zero.
+    is b's x axis; its other components are not measured and given as zero. An encoder counts whole ticks of
+    ``tick_m``, 0 as many as it likes. In each of ``slips`` stretches of 1 to 3 s, ``slips_s`` (k, 2) of ``drawn``, it
+    turns 20 to 50 % too far.
     """
     edges_ns = ticks(scene.duration_s, rate_hz)
 
@@ -110,13 +124,21 @@ def odometer(scene: Scene, sensor: Odometer, rng: np.random.Generator, *, rate_h
     true = period_means(speed, edges_ns, panel_s=1 / rate_hz)[:, 0]
     scale = sensor.scale + sensor.scale_sd * rng.standard_normal()
     measured = (1 + scale) * true + sensor.sigma_mps * rng.standard_normal(len(true))
+    drawn = {"scale": scale}
+    if slips > 0:
+        at, length, excess = rng.random((slips, 3)).T * [[scene.duration_s], [2.0], [0.3]] + [[0.0], [1.0], [0.2]]
+        end_s = edges_ns[1:, None] * 1e-9
+        measured += true * (((end_s > at) & (end_s < at + length)) @ excess)
+        drawn["slips_s"] = np.column_stack([at, at + length])
+    if tick_m > 0:
+        measured = np.diff(np.floor(np.cumsum(measured / rate_hz) / tick_m), prepend=0.0) * tick_m * rate_hz
 
     def series(offset_s: float, forward: Floats) -> Series:
         stamps = START_NS + edges_ns[1:] + round(offset_s * NS)
         columns = {"linear": np.pad(forward[:, None], ((0, 0), (0, 2))), "angular": np.zeros((len(forward), 3))}
         return Series(sensor.topic, "geometry_msgs/msg/TwistStamped", stamps, columns, "odometer")
 
-    return Sensed(series(sensor.clock_offset_s, measured), series(0.0, true), {"scale": scale})
+    return Sensed(series(sensor.clock_offset_s, measured), series(0.0, true), drawn)
 
 
 def magnetometer(
@@ -129,12 +151,15 @@ def magnetometer(
     dip_deg: float = 65.0,
     noise_t: float | None = None,
     motor_t: float = 0.0,
+    residual_ut: float = 0.0,
+    disturb: Disturbance | None = None,
 ) -> Sensed:
-    """The Earth's field, T, and that of an electric motor on the machine.
+    """The Earth's field, T, and what the machine and its surroundings add to it in the log, not in ``clean``.
 
-    The noise is white on every axis, ``noise_t`` or what gives the horizontal direction the rig's sigma. The motor's
-    field alternates along a direction of the body drawn anew, between half and one and a half times ``motor_t`` with
-    the load; sampled, it beats at a few hertz.
+    The noise is white on every axis, ``noise_t`` or what gives the horizontal direction the rig's sigma. The field of
+    an electric motor alternates along a direction of the body drawn anew, between half and one and a half times
+    ``motor_t`` with the load; sampled, it beats at a few hertz. ``residual_ut`` is the size of a field that goes with
+    the machine and that the rig does not know; ``disturb`` adds another.
     """
     t_ns = ticks(scene.duration_s, rate_hz)
     declination_deg = sensor.declination_deg + sensor.declination_sd_deg * rng.standard_normal()
@@ -143,7 +168,8 @@ def magnetometer(
     magnetic_north = np.cos(declination) * north + np.sin(declination) * np.cross(north, up)  # north x up is east
     field_n = field_t * (np.cos(dip) * magnetic_north - np.sin(dip) * up)
     # in b first, then in the sensor's axes; the machine's own field is fixed in the latter
-    clean = field_n @ scene.motion(t_ns * 1e-9).R @ sensor.R_bm + 1e-6 * np.array(sensor.hard_iron_ut)
+    motion = scene.motion(t_ns * 1e-9)
+    clean = field_n @ motion.R @ sensor.R_bm + 1e-6 * np.array(sensor.hard_iron_ut)
     sigma = np.radians(sensor.sigma_deg) * field_t * np.cos(dip) if noise_t is None else noise_t
     white = rng.standard_normal(clean.shape)
     axis, phase = rng.standard_normal(3), 2 * np.pi * rng.random(2)
@@ -155,7 +181,16 @@ def magnetometer(
         return Series(sensor.topic, "sensor_msgs/msg/MagneticField", stamps, {"field": values}, "imu")
 
     measured = clean + sigma * white + motor[:, None] * axis / np.linalg.norm(axis) @ sensor.R_bm
-    return Sensed(series(sensor.clock_offset_s, measured), series(0.0, clean), {"declination_deg": declination_deg})
+    drawn: dict[str, Any] = {"declination_deg": declination_deg}
+    if residual_ut > 0:
+        direction = rng.standard_normal(3)
+        drawn["residual_ut"] = residual_ut * direction / np.linalg.norm(direction)
+        measured += 1e-6 * drawn["residual_ut"]
+    if disturb is not None:
+        added_n, told = disturb(t_ns * 1e-9, motion.R, field_n)
+        measured += rotate_back(motion.R, added_n) @ sensor.R_bm
+        drawn |= told
+    return Sensed(series(sensor.clock_offset_s, measured), series(0.0, clean), drawn)
 
 
 def barometer(
