@@ -67,12 +67,22 @@ def ride(
 ) -> Simulation:
     """Down at ``speed_mps``, standing after ``whole_s``."""
     t_s = shaft.times(duration)
-    pace = smooth_step(t_s / RAMP_S) * smooth_step((whole_s - t_s) / RAMP_S)
-    path = np.zeros((len(t_s), 6))
-    path[:, 2] = -integral(t_s, speed_mps * pace)
-    shaking = rails(t_s, vibration * (not nominal) * speed_mps * pace, stream(seed, "vibration"))
-    motion = Motion(Spline(t_s, path), (shaking,))
+    speed = pace(t_s, speed_mps, whole_s)
+    shaking = rails(t_s, vibration * (not nominal) * speed, stream(seed, "vibration"))
+    motion = Motion(down(t_s, speed), (shaking,))
     return shaft.record(name, motion, machine, seed, duration, 0.0, 0.0, air_sd_k, nominal, without="laser")
+
+
+def pace(t_s: Floats, speed_mps: float, whole_s: float) -> Floats:
+    """Speed of a ride of ``whole_s``, m/s, (n,)."""
+    return speed_mps * smooth_step(t_s / RAMP_S) * smooth_step((whole_s - t_s) / RAMP_S)
+
+
+def down(t_s: Floats, speed: Floats) -> Spline:
+    """The undisturbed way at ``speed`` (n,) m/s, level and straight."""
+    path = np.zeros((len(t_s), 6))
+    path[:, 2] = -integral(t_s, speed)
+    return Spline(t_s, path)
 
 
 def rails(t_s: Floats, speed: Floats, rng: np.random.Generator) -> Lines:

@@ -60,3 +60,9 @@ def test_usage_exits_2():
     done = subprocess.run([sys.executable, "-m", "datasets", "make"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "usage" in done.stderr
+
+
+def test_without_a_duration_a_log_has_its_own_length(tmp_path, capsys):
+    path = tmp_path / "static.mcap"
+    assert main(["make", "shaft-static", "-o", str(path)]) == 0
+    assert "/imu/data 2000, /imu/mag 2001" in capsys.readouterr().out  # 40 s at 50 Hz
