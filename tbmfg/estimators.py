@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.fields import Node, near
-from tbmfg.rig import Rig, switches
+from tbmfg.rig import Rig, kind_of, switches
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
@@ -91,6 +92,35 @@ def _online(problem: Problem, name: str, online: Online, last_cov: Floats) -> Re
     return out
 
 
+def shearer(problem: Problem, progress: Progress, name: str) -> Result:
+    """One of the Kalman filters of Yan & Wang (2021)."""
+    import numpy as np
+
+    from tbmfg.filters import shearer as filter_
+    from tbmfg.inertial.steps import to_ns
+    from tbmfg.outcome import beyond_gate, result, ungated
+
+    design = filter_.DESIGNS[name]
+    seen = filter_.view(problem, design)
+    f = filter_.run(seen, design, switches(problem.rig, name, design.switches), progress)
+    gated = {sensor: np.zeros(len(nis), dtype=bool) for sensor, nis in f.nis.items()}
+    edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
+    out = result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, gated, edges_ns)
+    out.warnings += ungated(beyond_gate(seen, f.nis))
+    return out
+
+
+def _shearer(name: str, summary: str, *needs: str) -> Estimator:
+    """The entry of one of them; its switches stand beside its design."""
+
+    def load() -> type[Node]:
+        from tbmfg.filters.shearer import DESIGNS
+
+        return DESIGNS[name].switches
+
+    return Estimator(partial(shearer, name=name), summary, ("imu", *needs), "Yan & Wang (2021)", load)
+
+
 ESTIMATORS: dict[str, Estimator] = {
     "batch": Estimator(
         batch,
@@ -116,6 +146,19 @@ ESTIMATORS: dict[str, Estimator] = {
         ("imu",),
         "Groves (2013) ch. 14",
     ),
+    "shearer-sins": _shearer("shearer-sins", "inertial navigation alone, with the covariance of its drift"),
+    "shearer-sins-od": _shearer(
+        "shearer-sins-od", "inertial navigation corrected by every speed of the odometer", "odometer"
+    ),
+    "shearer-ckf": _shearer(
+        "shearer-ckf", "shearer-sins-od and magnetic yaw in one Kalman filter without gates", "odometer", "magnetometer"
+    ),
+    "shearer-ckf-ar": _shearer(
+        "shearer-ckf-ar", "shearer-ckf with noise found from the innovations", "odometer", "magnetometer"
+    ),
+    "shearer-afkf": _shearer(
+        "shearer-afkf", "shearer-ckf-ar as a federation of two local filters", "odometer", "magnetometer"
+    ),
 }
 
 
@@ -126,6 +169,10 @@ def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], No
         raise TbmfgError(f"no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
     from tbmfg.problem import breakdown_explained
 
+    if (reason := unmet(name, problem)) is not None:
+        raise EstimationError(
+            f"{name} {reason}, of which this log and rig have nothing to use; tbmfg info LOG lists its topics"
+        )
     with breakdown_explained(name):
         result = ESTIMATORS[name].run(problem, lambda share: progress(name, share) if progress else None)
     _refuse_nonsense(problem, result)
@@ -136,6 +183,13 @@ def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], No
                 "gated; do not trust it before the rig's entry for this sensor is checked"
             )
     return result
+
+
+def unmet(name: str, problem: Problem) -> str | None:
+    """What an estimator needs and this problem does not have, or None."""
+    have = {"imu", *map(kind_of, problem.samples)}
+    missing = [kind for kind in ESTIMATORS[name].needs if kind not in have]
+    return f"needs {', '.join(missing)}" if missing else None
 
 
 def check_switches(rig: Rig) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from tbmfg.earth import north_direction
 from tbmfg.geometry import exp_so3, rotation_from_rpy
 from tbmfg.inertial.steps import GAP, Steps, step_index
+from tbmfg.inertial.strapdown import rotations
 from tbmfg.rig import Barometer, Keyframes, Magnetometer, Odometer, PositionSensor
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
@@ -86,6 +87,11 @@ class GyroFrame:
         return np.stack(angle, axis=1) / (high - low)[:, None]
 
 
+def gyro_frame(steps: Steps, gyro: Floats, bias_gyro: Floats) -> GyroFrame:
+    """The frame of compensated rates ``gyro`` (n, 3) that a bias (3,) is still to be taken from."""
+    return GyroFrame(steps, rotations(steps.edges_s, gyro, bias_gyro), gyro - bias_gyro, bias_gyro)
+
+
 def position_rows(
     sensor: PositionSensor,
     fixes: Samples,
@@ -108,12 +114,7 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
 
     Intervals that the samples do not cover are left out.
     """
-    spacing = np.diff(speeds.t_s)
-    period = float(np.median(spacing))
-    ends = speeds.t_s - sensor.clock_offset
-    # stamps jitter: a sample covers the time since the one before, unless one was lost between them
-    alone = np.append(True, spacing > GAP * period)
-    starts = ends - np.where(alone, period, np.append(period, spacing))
+    starts, ends, period = _periods(sensor, speeds)
     steps = frame.steps
     middle = 0.5 * (steps.edges_s[:-1] + steps.edges_s[1:])
     k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)
@@ -138,6 +139,34 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
     sigma = per_sample * np.sqrt(period * length[i])[:, None]
     samples = np.searchsorted(ends, keyframes_s[i + 1] + 1e-9) - np.searchsorted(ends, keyframes_s[i] + 1e-9)
     return Rows(speeds.sensor, "odometer", i, i + 1, D, data, sigma, calib, samples, sensor.loss)
+
+
+def wheel_rows(sensor: Odometer, speeds: Samples, edges_s: Floats, frame: GyroFrame, calib: slice) -> Rows:
+    """Every sample by itself: a mean over a period is the speed at its middle, taken at the IMU edge nearest to that.
+
+    Exact for a constant acceleration; the angular rate that the arm is turned with is a mean over the same period.
+    """
+    starts, ends, period = _periods(sensor, speeds)
+    middle = 0.5 * (starts + ends)
+    inside = (middle >= edges_s[0]) & (middle <= edges_s[-1])
+    t = middle[inside]
+    k = nearest(edges_s, t)
+    rate = frame.rate(t, 0.5 * period) + frame.bias_gyro
+    smooth = _running_mean(speeds.values, round(SMOOTHED_S / period))[inside]
+    data = np.column_stack([np.tile(sensor.arm, (len(t), 1)), rate, smooth])
+    sigma = np.tile([sensor.sigma, sensor.lateral_sigma, sensor.lateral_sigma], (len(t), 1))
+    z, ones = speeds.values[inside, None], np.ones(len(t), dtype=int)
+    return Rows(speeds.sensor, "wheel", k, k, z, data, sigma, calib, ones, sensor.loss)
+
+
+def _periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
+    """Start and end of the time that each sample is the mean over, and the sensor's usual period [s]."""
+    spacing = np.diff(speeds.t_s)
+    period = float(np.median(spacing))
+    ends = speeds.t_s - sensor.clock_offset
+    # stamps jitter: a sample covers the time since the one before, unless one was lost between them
+    alone = np.append(True, spacing > GAP * period)
+    return ends - np.where(alone, period, np.append(period, spacing)), ends, period
 
 
 def magnetometer_rows(

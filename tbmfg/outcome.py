@@ -12,7 +12,9 @@ from tbmfg import diagnosis
 from tbmfg.geometry import quat_from_matrix
 from tbmfg.problem import GATE, Problem
 from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
-from tbmfg.timeseries import Floats
+from tbmfg.timeseries import Floats, Times
+
+CONTRADICTING = 0.02  # share of rows beyond the gate, of which chance puts 0.1 % there, from which it is said
 
 
 def trajectory(problem: Problem, x: Floats, cov: Floats) -> Trajectory:
@@ -37,12 +39,17 @@ def result(
     c_cov: Floats,
     nis: dict[str, Floats],
     gated: dict[str, np.ndarray],
+    row_times_ns: Times | None = None,
 ) -> Result:
-    """What an estimator returns, from its states, calibrations ``c`` (m,) with covariance, and rows' NIS and gates."""
+    """What an estimator returns, from its states, calibrations ``c`` (m,) with covariance, and rows' NIS and gates.
+
+    The problem's rows lie at keyframes, or, if ``row_times_ns`` is given, at these stamps.
+    """
     path = trajectory(problem, x, cov)
     sd = np.sqrt(np.maximum(np.diag(c_cov), 0.0))
+    row_times_ns = path.t_ns if row_times_ns is None else row_times_ns
     innovations = {
-        rows.sensor: Innovations(path.t_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
+        rows.sensor: Innovations(row_times_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
         for rows in problem.rows
     }
     stretches = diagnosis.gated_stretches(innovations)
@@ -64,6 +71,16 @@ def result(
 def beyond_gate(problem: Problem, nis: dict[str, Floats]) -> dict[str, np.ndarray]:
     """Which rows lie beyond the gate, by sensor."""
     return {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+
+
+def ungated(beyond: dict[str, np.ndarray]) -> list[str]:
+    """Say for a filter without gates where a gate would have spoken far more often than by chance."""
+    return [
+        f"{sensor}: {np.mean(rows):.0%} of its samples contradict the estimate (beyond the {GATE:.1%} gate of other "
+        "estimators); this filter has no gate and took them all"
+        for sensor, rows in beyond.items()
+        if np.mean(rows) > CONTRADICTING
+    ]
 
 
 def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrated]:

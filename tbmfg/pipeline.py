@@ -24,7 +24,7 @@ from tbmfg.results import (
     write_result,
     write_text,
 )
-from tbmfg.rig import Rig, dump_rig, kind_of, load_rig, override, parse_rig
+from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
 from tbmfg.state import Calibrated, Result, Truth
 from tbmfg.timeseries import NS, Log
 
@@ -172,6 +172,8 @@ def compare(
     With ``output`` every estimator's files go to a folder of its name, and compare.json beside them. The other
     arguments are those of :func:`run`. Raises TbmfgError when none ran.
     """
+    from tbmfg.estimators import unmet
+
     known_estimators(estimators)
     if output is not None:
         refuse_existing_file(Path(output) / COMPARISON, force)
@@ -205,15 +207,6 @@ def known_estimators(names: Sequence[str]) -> None:
     for name in names:
         if name not in ESTIMATORS:
             raise TbmfgError(f"no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
-
-
-def unmet(name: str, prepared: Problem) -> str | None:
-    """What an estimator needs and this problem does not have, or None."""
-    from tbmfg.estimators import ESTIMATORS
-
-    have = {"imu", *(kind_of(rows.sensor) for rows in prepared.rows)}
-    missing = [kind for kind in ESTIMATORS[name].needs if kind not in have]
-    return f"needs {', '.join(missing)}" if missing else None
 
 
 def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> tuple[Rig, list[str]]:

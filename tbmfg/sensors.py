@@ -81,6 +81,16 @@ def prism(z, data, xi, xj, c):
 
 
 @njit(cache=True)
+def _into_wheel(c: np.ndarray):
+    """E^T for the wheel's axes E = Rz(yaw) Ry(pitch) in b, its derivatives to yaw and pitch; c: scale, yaw, pitch."""
+    cy, sy, cp, sp = np.cos(c[1]), np.sin(c[1]), np.cos(c[2]), np.sin(c[2])
+    Et = np.array([[cy * cp, sy * cp, -sp], [-sy, cy, 0.0], [cy * sp, sy * sp, cp]])
+    by_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
+    by_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
+    return Et, by_yaw, by_pitch
+
+
+@njit(cache=True)
 def odometer(z, data, xi, xj, c):
     """Displacement of the contact point over an interval, in the wheel's axes at its start.
 
@@ -93,10 +103,7 @@ def odometer(z, data, xi, xj, c):
     """
     n, d = len(z), xi.shape[1] - 6
     r, Ji, Jj, Jc = np.empty((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, d)), np.zeros((n, 3, 3))
-    cy, sy, cp, sp = np.cos(c[1]), np.sin(c[1]), np.cos(c[2]), np.sin(c[2])
-    Et = np.array([[cy * cp, sy * cp, -sp], [-sy, cy, 0.0], [cy * sp, sy * sp, cp]])
-    Et_yaw = np.array([[-sy * cp, cy * cp, 0.0], [-cy, -sy, 0.0], [-sy * sp, cy * sp, 0.0]])
-    Et_pitch = np.array([[-cy * sp, -sy * sp, -cp], [0.0, 0.0, 0.0], [cy * cp, sy * cp, -sp]])
+    Et, Et_yaw, Et_pitch = _into_wheel(c)
     share = c[0] / (1.0 + c[0])
     for k in range(n):
         x, y, arm, B = xi[k], xj[k], data[k, :3], data[k, 3:6]
@@ -126,6 +133,38 @@ def odometer(z, data, xi, xj, c):
                     Jj[k, a, 3 + b] += Et[a, q] * x[3 * b + q]
                     Ji[k, a, 12 + b] -= Et[a, q] * skew_B[q, b]
     return r, Ji, Jj, Jc
+
+
+@njit(cache=True)
+def wheel(z, data, xi, xj, c):
+    """Velocity of the odometer's contact point in the wheel's axes: forward as indicated, none sideways or upwards.
+
+    z (1): indicated speed [m/s]. data (7): the contact point's arm l in b, the angular rate w in b as measured, and z~,
+    the speed smoothed over seconds. c (3): scale s, mounting yaw and pitch [rad], E = Rz(yaw) Ry(pitch).
+    r = E^T (R^T v + (w - b_g) x l) - [z - s / (1 + s) z~, 0, 0]: shearer (7), (8), (11) turned from n into the wheel's
+    axes, where the noise R_1 is diagonal. For z~ see ``odometer``; the paper has z, whose noise passes for scale.
+    """
+    n, d = len(z), xi.shape[1] - 6
+    r, Ji, Jc = np.zeros((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, 3))
+    Et, Et_yaw, Et_pitch = _into_wheel(c)
+    for k in range(n):
+        x, arm, w = xi[k], data[k, :3], data[k, 3:6] - xi[k, 18:21]
+        u = _unrotate(x, x[12:15])
+        turn_u = np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])
+        skew_arm = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
+        for q in range(3):
+            contact = u[q] - (skew_arm[q, 0] * w[0] + skew_arm[q, 1] * w[1] + skew_arm[q, 2] * w[2])
+            for a in range(3):
+                r[k, a] += Et[a, q] * contact
+                Jc[k, a, 1] += Et_yaw[a, q] * contact
+                Jc[k, a, 2] += Et_pitch[a, q] * contact
+                for b in range(3):
+                    Ji[k, a, b] += Et[a, q] * turn_u[q, b]
+                    Ji[k, a, 6 + b] += Et[a, q] * x[3 * b + q]
+                    Ji[k, a, 12 + b] += Et[a, q] * skew_arm[q, b]
+        r[k, 0] += c[0] / (1.0 + c[0]) * data[k, 6] - z[k, 0]
+        Jc[k, 0, 0] = data[k, 6] / (1.0 + c[0]) ** 2
+    return r, Ji, np.zeros((n, 3, 0)), Jc
 
 
 @njit(cache=True)
@@ -184,12 +223,15 @@ def bounded(z, data, xi, xj, c):
     return xi[:, 9:15] - z, Ji, np.zeros((n, 6, 0)), np.zeros((n, 6, 0))
 
 
-MODELS: dict[str, Callable] = {f.__name__: f for f in (prism, odometer, magnetometer, barometer, velocity, bounded)}
+MODELS: dict[str, Callable] = {
+    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, bounded)
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
     """Measurements of one sensor: row r links keyframes ``i[r]`` and ``j[r]`` (equal for one time), i in order.
+    For filters that take every sample when it comes they are IMU edges in place of keyframes.
 
     ``z`` (n, .), ``data`` (n, .) as the model wants them; ``sigma`` (n, k); ``calib`` where the sensor's calibrations
     lie in the calibration vector; ``samples`` (n,) messages behind each row; ``loss`` none, huber or cauchy.

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import multivariate_normal
 
-from tbmfg.filters.kalman import correct, innovation
+from tbmfg.filters.kalman import correct, innovation, innovation_noise, predict
 from tests.problems import EPS
 
 
@@ -36,6 +36,65 @@ def test_correction_is_the_information_form(k):
     rounding = 100 * EPS * np.linalg.cond(P)
     assert_allclose(P1, expected, rtol=rounding, atol=rounding * np.abs(expected).max())
     assert_allclose(dx, -expected @ H.T @ r, rtol=rounding, atol=rounding)
+
+
+def test_a_given_noise_is_that_of_whitened_rows():
+    P, H, r = problem(7)
+    A = np.random.default_rng(8).standard_normal((3, 3))
+    R = A @ A.T + np.eye(3)
+    white = np.linalg.inv(np.linalg.cholesky(R))
+    for given, whitened in zip(correct(P, H, r, R), correct(P, white @ H, white @ r), strict=True):
+        assert_allclose(given, whitened, rtol=1e-10, atol=1e-10)
+    nis, logdet = innovation(P, H, r, R)
+    expected = innovation(P, white @ H, white @ r)
+    assert nis == pytest.approx(expected[0], rel=1e-10)
+    assert logdet == pytest.approx(expected[1] + np.linalg.slogdet(R)[1], rel=1e-10)
+
+
+def test_prediction_moves_the_first_states_only():
+    P, _, _ = problem(9)
+    rng = np.random.default_rng(10)
+    Phi, Q = rng.standard_normal((5, 5)), np.diag(rng.random(5))
+    whole, noise = np.eye(9), np.zeros((9, 9))
+    whole[:5, :5], noise[:5, :5] = Phi, Q
+    assert_allclose(predict(P, Phi, Q), whole @ P @ whole.T + noise, rtol=1e-13, atol=1e-13)
+
+
+def test_noise_from_innovations_of_a_stationary_stream():
+    """Mehra's estimate of R with its floor off, averaged over 10 000 epochs, is R.
+
+    Innovations e of the right filter are white with covariance S. The mean of all windows' C weighs e_j e_j^T by
+    w_j, how many windows hold it over windows x length, so each entry has the variance (S_aa S_bb + S_ab^2) sum w_j^2.
+    """
+    rng = np.random.default_rng(11)
+    Phi, Q = np.array([[1.0, 0.1], [-0.2, 0.95]]), np.diag([0.02, 0.1])
+    H, R = np.array([[1.0, 0.0], [0.5, 2.0]]), np.array([[1.0, 0.3], [0.3, 2.0]])
+    P = np.eye(2)
+    for _ in range(500):  # to the steady state
+        _, after = correct(P, H, np.zeros(2), R)
+        P = predict(after, Phi, Q)
+    true = np.linalg.cholesky(P) @ rng.standard_normal(2)
+    x, epochs, window = np.zeros(2), 10_000, 20
+    e = np.empty((epochs + window - 1, 2))
+    for k in range(len(e)):
+        e[k] = H @ (x - true) - np.linalg.cholesky(R) @ rng.standard_normal(2)
+        x = Phi @ (x + correct(P, H, e[k], R)[0])
+        true = Phi @ true + np.sqrt(np.diag(Q)) * rng.standard_normal(2)
+    found = [innovation_noise(e[k : k + window], H @ P @ H.T, floor=-np.inf) for k in range(epochs)]
+    S = H @ P @ H.T + R
+    weights = np.convolve(np.ones(epochs), np.ones(window)) / (epochs * window)
+    error = np.sqrt((np.outer(np.diag(S), np.diag(S)) + S**2) * np.sum(weights**2))
+    assert np.abs((np.mean(found, axis=0) - R) / error).max() < 3
+    # H12: without subtracting, it is S that is found, and that is another matrix
+    assert np.abs((np.mean(found, axis=0) + H @ P @ H.T - R) / error).max() > 20
+
+
+def test_noise_from_innovations_is_never_below_the_floor():
+    e = np.random.default_rng(12).standard_normal((20, 3)) * [0.1, 1.0, 30.0]
+    R = innovation_noise(e, 0.5 * np.eye(3))
+    values = np.linalg.eigvalsh(R)
+    assert values.min() == pytest.approx(1.0, abs=1e-12)
+    assert values.max() == pytest.approx(np.linalg.eigvalsh(e.T @ e / 20)[-1] - 0.5, rel=1e-9)
 
 
 def test_rows_together_or_one_by_one():

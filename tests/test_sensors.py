@@ -33,6 +33,7 @@ CASES = {
         [0.07, 0.21, -0.13],
         80.0,
     ),
+    "wheel": ([1.3], [-0.4, 0.3, -1.1, 0.7, -1.1, 0.9, 1.1], [0.07, 0.21, -0.13], 10.0),
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
     "magnetometer": ([14.0, -17.0, -31.0], [0.4], [0.05], 20.0),
     "barometer": ([11.2], [0.04, 1.0], [], 20.0),
@@ -43,6 +44,7 @@ BINARY = {"odometer"}
 CALIBRATIONS = {
     "prism": ["arm.x", "arm.y", "arm.z", "offset"],
     "odometer": ["scale", "yaw", "pitch"],
+    "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination"],
 }
 
@@ -205,6 +207,20 @@ def test_odometer_allows_for_a_gyro_bias_found_later():
     second_order = v * T * (np.linalg.norm(error) * T) ** 2
     assert_allclose(residual, 0.0, atol=second_order)
     assert np.linalg.norm(D - [v * T, 0, 0]) > 50 * second_order, "the bias matters in this test"
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.08, -0.3])
+@pytest.mark.parametrize("speed", [1.7, -1.7])
+def test_wheel_on_a_turning_body(scale, speed):
+    """The contact point rolls along an axis 12 degrees left and 7 down of b's x axis, the body turns about it."""
+    yaw, pitch, arm, w = np.radians(12.0), np.radians(7.0), np.array([-0.4, 0.3, -1.1]), np.array([0.7, -1.1, 0.9])
+    R, E = X_I[:9].reshape(3, 3), rotation_from_rpy(np.array([0.0, pitch, yaw]))
+    x = X_I.copy()
+    x[12:15] = R @ (speed * E[:, 0] - np.cross(w, arm))
+    indicated = (1 + scale) * speed
+    data = np.concatenate([arm, w + x[18:21], [indicated]])[None]
+    residual, *_ = sensors.wheel(np.array([[indicated]]), data, x[None], x[None], np.array([scale, yaw, pitch]))
+    assert_allclose(residual, 0.0, atol=20 * EPS * 3.0)
 
 
 # ---- magnetometer, barometer, bounds ----

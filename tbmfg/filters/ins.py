@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import chi2
 
-from tbmfg.filters.kalman import correct, innovation
+from tbmfg.filters.kalman import correct, innovation, predict
 from tbmfg.inertial.strapdown import correct_state, propagate
 from tbmfg.problem import GATE, Problem
 from tbmfg.sensors import Rows
@@ -81,9 +81,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
             cuts = edges if pieces <= 1 else np.linspace(*edges, pieces + 1).astype(int)
             for first, last in pairwise(cuts):
                 x[:21], Phi, Q = propagate(x[:21], first, last, steps.edges_s, inertial.gyro, inertial.acc, *noise)
-                P[:NAV] = Phi @ P[:NAV]
-                P[:, :NAV] = P[:, :NAV] @ Phi.T
-                P[:NAV, :NAV] += Q
+                P = predict(P, Phi, Q)
             P[np.arange(NAV, d), np.arange(NAV, d)] += problem.drift_walk**2 * elapsed
         for rows in problem.rows:
             sensor = rows.sensor

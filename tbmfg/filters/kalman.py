@@ -1,4 +1,7 @@
-"""Kalman algebra: pure functions (compiled)."""
+"""Kalman algebra: pure functions (compiled), shared by every filter.
+
+Rows are whitened, so that their noise is one; ``R`` (k, k) replaces it where a filter finds another than the rig's.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,45 @@ from numba import njit
 
 
 @njit(cache=True)
-def innovation(P, H, r):
-    """Squared normalised innovation r^T S^-1 r and log det S for whitened rows: S = H P H^T + I."""
-    S = H @ P @ H.T + np.eye(len(r))
+def predict(P, Phi, Q):
+    """Time update: P of (n, n), of which the first states go by ``Phi`` (m, m) with noise ``Q``; the rest stays."""
+    m = len(Phi)
+    out = P.copy()
+    out[:m] = Phi @ out[:m]
+    out[:, :m] = np.ascontiguousarray(out[:, :m]) @ Phi.T
+    out[:m, :m] += Q
+    return out
+
+
+@njit(cache=True)
+def innovation(P, H, r, R=None):
+    """Squared normalised innovation r^T S^-1 r and log det S: S = H P H^T + R, R = I unless given."""
+    S = H @ P @ H.T + (np.eye(len(r)) if R is None else R)
     L = np.linalg.cholesky(S)
     y = np.linalg.solve(L, r)
     return y @ y, 2.0 * np.sum(np.log(np.diag(L)))
 
 
 @njit(cache=True)
-def correct(P, H, r):
-    """Joseph update with whitened rows ``H`` (k, n), residual ``r`` = h(x) - z (k,): error state and covariance.
+def correct(P, H, r, R=None):
+    """Joseph update with rows ``H`` (k, n), residual ``r`` = h(x) - z (k,), R = I unless given: error, covariance.
 
-    K = P H^T S^-1; dx = -K r; P+ = (I - K H) P (I - K H)^T + K K^T, multiplied out.
+    K = P H^T S^-1; dx = -K r; P+ = (I - K H) P (I - K H)^T + K R K^T, multiplied out.
     """
     PHt = P @ H.T
-    S = H @ PHt + np.eye(len(r))
+    S = H @ PHt + (np.eye(len(r)) if R is None else R)
     K = np.linalg.solve(S, PHt.T).T
     KPHt = K @ PHt.T
     P1 = P - KPHt - KPHt.T + K @ S @ K.T
     return -(K @ r), 0.5 * (P1 + P1.T)
+
+
+def innovation_noise(residuals, HPHt, floor=1.0):
+    """Noise of rows by what their innovations leave after the state's doubt: R = C - H P H^T, (k, k).
+
+    C is the mean of e e^T over a window of ``residuals`` (N, k), about no mean; eigenvalues are held at ``floor`` from
+    below, 1 being the rig's noise. Mehra (1972); shearer (32) with H12: C itself estimates S = H P H^T + R.
+    """
+    C = residuals.T @ residuals / len(residuals)
+    values, vectors = np.linalg.eigh(C - HPHt)
+    return (vectors * np.maximum(values, floor)) @ vectors.T

@@ -10,8 +10,7 @@ from tbmfg import earth
 from tbmfg.geometry import rotation_from_rpy, rotation_z, yaw_of
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps, compensate
-from tbmfg.inertial.strapdown import rotations
-from tbmfg.measure import GyroFrame, Samples
+from tbmfg.measure import GyroFrame, Samples, gyro_frame
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import Parameters
 from tbmfg.rig import Magnetometer, Odometer, PositionSensor, Rig
@@ -54,8 +53,8 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
         longest = max(still, key=lambda s: s[1] - s[0])
         bias_gyro = steps.gyro[alignment.rows_between(steps, *longest)].mean(axis=0)
     gyro, acc = compensate(steps, bias_gyro, np.zeros(3))
-    R_0t = rotations(steps.edges_s, gyro, bias_gyro)
-    frame = GyroFrame(steps, R_0t, gyro - bias_gyro, bias_gyro)
+    frame = gyro_frame(steps, gyro, bias_gyro)
+    R_0t = frame.R_0t
     R_level = alignment.level_at_start(steps, R_0t, still)
 
     start = rig.initial
