@@ -114,7 +114,7 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
 
     Intervals that the samples do not cover are left out.
     """
-    starts, ends, period = _periods(sensor, speeds)
+    starts, ends, period = periods(sensor, speeds)
     steps = frame.steps
     middle = 0.5 * (steps.edges_s[:-1] + steps.edges_s[1:])
     k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)
@@ -146,7 +146,7 @@ def wheel_rows(sensor: Odometer, speeds: Samples, edges_s: Floats, frame: GyroFr
 
     Exact for a constant acceleration; the angular rate that the arm is turned with is a mean over the same period.
     """
-    starts, ends, period = _periods(sensor, speeds)
+    starts, ends, period = periods(sensor, speeds)
     middle = 0.5 * (starts + ends)
     inside = (middle >= edges_s[0]) & (middle <= edges_s[-1])
     t = middle[inside]
@@ -159,7 +159,7 @@ def wheel_rows(sensor: Odometer, speeds: Samples, edges_s: Floats, frame: GyroFr
     return Rows(speeds.sensor, "wheel", k, k, z, data, sigma, calib, ones, sensor.loss)
 
 
-def _periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
+def periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
     """Start and end of the time that each sample is the mean over, and the sensor's usual period [s]."""
     spacing = np.diff(speeds.t_s)
     period = float(np.median(spacing))
