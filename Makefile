@@ -17,7 +17,7 @@ demo: $(READY)
 	@mkdir -p demo
 	$(BIN)/python -m datasets make tbm-drive -o demo/tbm-drive.mcap --duration 120
 	$(BIN)/tbmfg compare demo/tbm-drive.mcap --estimators batch,ins --truth auto -o demo/result --force
-	@echo "the comparison is in demo/result/compare.json, the smoothed trajectory in demo/result/batch"
+	@echo "open demo/result/report.html; the smoothed trajectory is in demo/result/batch"
 
 test: lint
 	$(BIN)/python -m pytest -n 2

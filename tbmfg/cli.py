@@ -103,6 +103,7 @@ def run(
     without: Without = [],  # noqa: B006
     only: Only = "",
     overrides: Overrides = [],  # noqa: B006
+    report: Annotated[bool, typer.Option("--report", help="Write report.html too.")] = False,
     force: Force = False,
     debug: Debug = False,
 ) -> None:
@@ -114,7 +115,15 @@ def run(
 
         with _progress_bar() as progress:
             summary = pipeline.run(
-                log, rig=rig, estimator=estimator, truth=truth, output=output, force=force, progress=progress, **options
+                log,
+                rig=rig,
+                estimator=estimator,
+                truth=truth,
+                output=output,
+                report=report,
+                force=force,
+                progress=progress,
+                **options,
             )
         _print_summary(summary, output)
 
@@ -274,54 +283,28 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
     typer.echo(f"results: {output}")
 
 
-COMPARED = {  # column title: key of the metrics and the factor to the title's unit
-    "APE mm": ("ape_rms_m", 1e3),
-    "position mm": ("position_rms_m", 1e3),
-    "outage mm": ("outage_position_rms_m", 1e3),
-    "attitude deg": ("attitude_rms_deg", 1.0),
-    "yaw deg": ("yaw_rms_deg", 1.0),
-    "velocity mm/s": ("velocity_rms_mps", 1e3),
-    "NEES": ("nees_mean", 1.0),
-}
-
-
 def _print_comparison(summaries: dict[str, dict[str, Any]], output: Path) -> None:
     """One row per trajectory: an online solver has a causal one and its last estimates."""
-    ran = {name: summary for name, summary in summaries.items() if "not_run" not in summary}
+    from tbmfg import comparison
+    from tbmfg.results import REPORT
+
+    ran, rows = comparison.ran(summaries), comparison.rows(summaries)
     first = next(iter(ran.values()))
     typer.echo(f"{first['log']}: {first['keyframes']} keyframes over {first['duration_s']:.1f} s, rig {first['rig']}")
-    rows: list[tuple[str, dict[str, Any], float]] = []
-    for name, summary in ran.items():
-        own_s = summary["wall_s"] - summary["shared_s"]
-        smoothed = summary.get("metrics_smoothed")
-        rows.append((f"{name} (causal)" if smoothed else name, summary["metrics"] or {}, own_s))
-        if smoothed:
-            rows.append((f"{name} (last)", smoothed, own_s))
-    titles = [t for t, (key, _) in COMPARED.items() if any(metrics.get(key) is not None for _, metrics, _ in rows)]
+    columns = comparison.columns(rows)
     _print_table(
-        ["estimator", *titles, "own time s"],
-        [
-            (
-                name,
-                *(
-                    _number(None if metrics.get(COMPARED[t][0]) is None else metrics[COMPARED[t][0]] * COMPARED[t][1])
-                    for t in titles
-                ),
-                f"{own_s:.2f}",
-            )
-            for name, metrics, own_s in rows
-        ],
+        ["estimator", *(column.title for column in columns), "own time s"],
+        [(row.label, *(_number(column.of(row.metrics)) for column in columns), f"{row.own_s:.2f}") for row in rows],
         justify="right",
     )
     if first["metrics"] is not None:
         typer.echo(f"against {first['truth']}; NEES of a consistent estimator: {first['metrics']['nees_dof']}")
     typer.echo(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
-    for name, summary in summaries.items():
-        if "not_run" in summary:
-            typer.echo(f"{name} not run: {summary['not_run']}")
+    for name, reason in comparison.not_run(summaries).items():
+        typer.echo(f"{name} not run: {reason}")
     for warning in dict.fromkeys(warning for summary in ran.values() for warning in summary["warnings"]):
         typer.echo(f"warning: {warning}")
-    typer.echo(f"results: {output}")
+    typer.echo(f"results: {output}, to read: {output / REPORT}")
 
 
 def _print_table(header: list[str], rows: list[tuple[str, ...]], *, justify: str = "left") -> None:

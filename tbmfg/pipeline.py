@@ -15,6 +15,7 @@ import numpy as np
 from tbmfg import __version__
 from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.results import (
+    REPORT,
     find_truth,
     load_truth,
     refuse_existing,
@@ -30,6 +31,7 @@ from tbmfg.timeseries import NS, Log
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
+    from tbmfg.report import Report
 
 Progress = Callable[[str, float], None]
 Outage = tuple[str, float, float]
@@ -79,14 +81,34 @@ class Session:
             **self._deviation(result),
             "metrics": None,
         }
-        if self.reference is not None:
-            poses = truth_for(self.reference, self.log, self.prepared.rig, result.calibration)
+        poses = self.truth(result)
+        if poses is not None:
             t0_ns = self.prepared.t0_ns
             lost = [(t0_ns + round(start * NS), t0_ns + round(end * NS)) for _, start, end in self.options["outages"]]
             summary["metrics"] = evaluate(result.trajectory, poses, lost)
             if result.smoothed is not None:
                 summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
         return result, summary
+
+    def truth(self, result: Result) -> Truth | None:
+        """What ``result`` is compared with, None where there is nothing."""
+        if self.reference is None:
+            return None
+        return truth_for(self.reference, self.log, self.prepared.rig, result.calibration)
+
+    def report(self) -> Report:
+        """A report on this log that holds no result yet."""
+        from tbmfg.report import Report, stamps_of
+
+        problem = self.prepared
+        return Report(
+            title=f"{problem.rig.name}: {Path(self.log_path).name}",
+            rig_yaml=dump_rig(problem.rig),
+            t0_ns=problem.t0_ns,
+            stamps_s=stamps_of(self.log, problem.rig, problem.t0_ns),
+            found=tuple(problem.warnings),
+            assumed=self.assumed,
+        )
 
     def _deviation(self, result: Result) -> dict[str, Any]:
         """What the dual-coordinate method says of a machine with a laser, {"deviation": ...}; nothing for others."""
@@ -137,11 +159,13 @@ def run(
     *,
     estimator: str = "batch",
     output: str | Path | None = None,
+    report: bool = False,
     force: bool = False,
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, Any]:
-    """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files.
+    """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files, with
+    ``report`` report.html among them.
 
     ``options``: ``rig``, a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
     ``truth``: auto, none, a topic or a file. ``outages``: (sensor, start, end) in seconds from the first IMU sample,
@@ -154,7 +178,12 @@ def run(
     session = open_session(log_path, progress=progress, **options)
     result, summary = session.estimate(estimator, progress)
     if output is not None:
-        write_result(output, result, summary, dump_rig(session.prepared.rig), force=force)
+        text = None
+        if report:
+            told = session.report()
+            told.add(result, summary, session.truth(result))
+            text = told.html()
+        write_result(output, result, summary, dump_rig(session.prepared.rig), report=text, force=force)
     return summary
 
 
@@ -169,18 +198,20 @@ def compare(
 ) -> dict[str, dict[str, Any]]:
     """Run several estimators on one prepared log: {estimator: summary}, or {"not_run": why} for one that could not.
 
-    With ``output`` every estimator's files go to a folder of its name, and compare.json beside them. The other
-    arguments are those of :func:`run`. Raises TbmfgError when none ran.
+    With ``output`` every estimator's files go to a folder of its name, compare.json and report.html beside them. The
+    other arguments are those of :func:`run`. Raises TbmfgError when none ran.
     """
     from tbmfg.estimators import unmet
 
     known_estimators(estimators)
     if output is not None:
-        refuse_existing_file(Path(output) / COMPARISON, force)
+        for name in (COMPARISON, REPORT):
+            refuse_existing_file(Path(output) / name, force)
         for name in estimators:
             refuse_existing(Path(output) / name, force)
     session = open_session(log_path, progress=progress, **options)
     summaries: dict[str, dict[str, Any]] = {}
+    report = session.report()
     for name in dict.fromkeys(estimators):
         reason = unmet(name, session.prepared)
         if reason is None:
@@ -189,13 +220,15 @@ def compare(
             except EstimationError as error:
                 reason = str(error)
         if reason is not None:
-            summaries[name] = {"not_run": reason}
+            summaries[name] = report.summaries[name] = {"not_run": reason}
         elif output is not None:
+            report.add(result, summaries[name], session.truth(result))
             rig = dump_rig(session.prepared.rig)
             write_result(Path(output) / name, result, summaries[name], rig, force=force)
     if all("not_run" in summary for summary in summaries.values()):
         raise TbmfgError(f"{log_path}: none ran: " + "; ".join(f"{k}: {v['not_run']}" for k, v in summaries.items()))
     if output is not None:
+        write_text(Path(output) / REPORT, report.html(), force=force)
         write_text(Path(output) / COMPARISON, to_json(summaries), force=force)
     return summaries
 

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
 NIS_BINS = 60  # stretches of time that a summary gives the innovations in
 SUMMARY = "summary.json"
+REPORT = "report.html"
 # The summary is first to go and last to come: a folder that holds one holds a complete result.
-FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result.mcap", "rig.yaml", SUMMARY)
+FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result.mcap", "rig.yaml", REPORT, SUMMARY)
 
 
 # ---- a result folder ----
@@ -61,9 +62,15 @@ def refuse_existing_file(path: str | Path, force: bool) -> None:
 
 
 def write_result(
-    output: str | Path, result: Result, summary: dict[str, Any], rig_yaml: str, *, force: bool = False
+    output: str | Path,
+    result: Result,
+    summary: dict[str, Any],
+    rig_yaml: str,
+    *,
+    report: str | None = None,
+    force: bool = False,
 ) -> None:
-    """Write every file of ``result`` to the folder ``output``, which is made where it is missing.
+    """Write every file of ``result`` to the folder ``output``, which is made where it is missing; ``report`` is a page.
 
     The files are written under a hidden folder inside ``output`` (so on the same file system) and moved
     to their names when all are complete.
@@ -76,6 +83,8 @@ def write_result(
             _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
         write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=_diagnostics(result))
         (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
+        if report is not None:
+            (folder / REPORT).write_text(report, "utf-8")
         (folder / SUMMARY).write_text(to_json(summary), "utf-8")
 
     refuse_existing(output, force)

@@ -71,7 +71,8 @@ def toy(monkeypatch):
 
     def prepare(log, rig, *, outages=(), without=(), progress=None):
         calls.prepare.append({"rig": rig, "outages": outages, "without": without, "progress": progress})
-        return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, warnings=["imu: 3 samples lost"])
+        rows = [SimpleNamespace(sensor="prism")]
+        return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, rows=rows, warnings=["imu: 3 samples lost"])
 
     entry = SimpleNamespace(summary="Smoother.", needs=("imu", "prism"), source="tbmfg")
     names = {"batch": entry, "fixed-lag": entry}
@@ -107,6 +108,19 @@ def test_run_writes_and_prints(toy, tmp_path):
     assert "warning: odometer: not estimated" in ran.stdout
     assert f"results: {tmp_path / 'out'}" in ran.stdout
     assert parse_rig((tmp_path / "out" / "rig.yaml").read_text(), "rig.yaml").name == "toy"
+
+
+def test_a_report_is_written_where_it_is_asked_for(toy, tmp_path):
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path / "plain")).exit_code == 0
+    assert not (tmp_path / "plain" / "report.html").exists()
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path / "told"), "--report").exit_code == 0
+    assert "Errors against the truth" in (tmp_path / "told" / "report.html").read_text("utf-8")
+    ran = tbmfg("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch,fixed-lag")
+    assert f"to read: {tmp_path / 'report.html'}" in ran.stdout
+    report = (tmp_path / "report.html").read_text("utf-8")
+    assert all(label in report for label in ("batch", "fixed-lag (causal)", "fixed-lag (last)"))
+    (tmp_path / "compare.json").unlink()
+    assert "report.html: exists already" in fault("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch")
 
 
 def test_smoothed_trajectories_have_their_own_metrics(toy, tmp_path):

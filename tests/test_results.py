@@ -111,7 +111,7 @@ def test_npz_round_trip(tmp_path):
 
 
 def test_every_file_is_written(tmp_path):
-    write_result(tmp_path / "new" / "out", result(smoothed=True), {"a": 1}, "name: rig\n")
+    write_result(tmp_path / "new" / "out", result(smoothed=True), {"a": 1}, "name: rig\n", report="<p>")
     assert names_in(tmp_path / "new" / "out") == sorted(FILES)
     assert json.loads((tmp_path / "new" / "out" / "summary.json").read_text()) == {"a": 1}
 

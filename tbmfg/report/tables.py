@@ -1,0 +1,111 @@
+"""The tables of a report, as HTML; every text that comes from a log or a rig is escaped here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from tbmfg.comparison import columns, ran, rows
+from tbmfg.report.content import Report
+from tbmfg.report.panels import Pen
+from tbmfg.report.words import nees_bounds
+
+PARTS = ("used", "gated", "late", "duplicate", "nonfinite", "outage", "unused")
+
+
+def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A table of cells that are HTML already."""
+    if not body:
+        return ""
+    head = "".join(f"<th scope=col>{cell}</th>" for cell in header)
+    lines = "".join(
+        f"<tr><th scope=row>{first}</th>{''.join(f'<td>{cell}</td>' for cell in others)}</tr>"
+        for first, *others in body
+    )
+    return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table></div>"
+
+
+def comparison(report: Report, pen: dict[str, Pen]) -> str:
+    """A row for each trajectory: accuracy with the ratio to the best, consistency with its bounds, time."""
+    found = rows(report.summaries)
+    shown = columns(found)
+    body = []
+    for row in found:
+        cells = []
+        for column in shown:
+            value = column.of(row.metrics)
+            if value is None:
+                cells.append("–")
+            elif column.key == "nees_mean":
+                bounds = nees_bounds(row.metrics)
+                cells.append(f"{value:.3g}" + (f" <small>{bounds[0]:.2g} to {bounds[1]:.2g}</small>" if bounds else ""))
+            else:
+                best = min(v for other in found if (v := column.of(other.metrics)) is not None)
+                ratio = f" <small>× {value / best:.3g}</small>" if 0 < best < value else " <small>best</small>"
+                cells.append(f"{value:.3g}" + (ratio if len(found) > 1 else ""))
+        body.append([swatch(pen.get(row.label), row.label), *cells, f"{row.own_s:.2f}"])
+    header = ["estimator", *(escape(column.title) for column in shown), "own time s"]
+    first = next(iter(ran(report.summaries).values()))
+    notes = [f"Reading and preparing, once for all: {first['shared_s']:.2f} s."]
+    if first["metrics"] is not None:
+        notes.append(
+            "APE is taken after a rigid alignment to the truth, everything else without. NEES is the mean squared "
+            f"normalised error of the pose, {first['metrics']['nees_dof']} where errors and covariance agree; beside "
+            "it where it lies by chance in 99 % of runs as correlated as this one."
+        )
+    return table(header, body) + f"<p class=note>{escape(' '.join(notes))}</p>"
+
+
+def calibrations(report: Report, pen: dict[str, Pen]) -> str:
+    """A row for each calibration, a column for each estimator."""
+    summaries = ran(report.summaries)
+    names = list(dict.fromkeys(name for summary in summaries.values() for name in summary["calibration"]))
+    body = [
+        [escape(name), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
+        for name in names
+    ]
+    header = ["calibration", *(swatch(_first_pen(pen, name), name) for name in summaries)]
+    return table(header, body)
+
+
+def _calibrated(entry: dict[str, Any] | None) -> str:
+    if entry is None:
+        return "–"
+    values, sds = (x if isinstance(x, list | tuple) else [x] for x in (entry["value"], entry["sd"]))
+    if not entry["estimated"]:
+        return f"{', '.join(number(x) for x in values)} <small>given, not estimated</small>"
+    return "<br>".join(f"{number(value)} <small>± {number(sd)}</small>" for value, sd in zip(values, sds, strict=True))
+
+
+def counts(report: Report) -> str:
+    """Where every sample went, by sensor and estimator; estimators that agree share a row."""
+    summaries = ran(report.summaries)
+    shown = [part for part in PARTS if any(c[part] for s in summaries.values() for c in s["sensors"].values())]
+    body = []
+    for sensor in dict.fromkeys(name for summary in summaries.values() for name in summary["sensors"]):
+        by_counts: dict[tuple[str, ...], list[str]] = {}
+        for name, summary in summaries.items():
+            if sensor in summary["sensors"]:
+                own = summary["sensors"][sensor]
+                by_counts.setdefault(tuple(str(own[part]) for part in ("received", *shown)), []).append(name)
+        for cells, names in by_counts.items():
+            body.append([escape(sensor), escape("all" if len(by_counts) == 1 else ", ".join(names)), *cells])
+    return table(["sensor", "estimator", "received", *shown], body)
+
+
+def swatch(pen: Pen | None, label: str) -> str:
+    """A name with the colour and stroke that it has in the figures."""
+    if pen is None:
+        return escape(label)
+    style = "dotted" if pen.dash == "dot" else "solid" if pen.dash == "solid" else "dashed"
+    return f'<span class=swatch style="border-top:3px {style} {pen.colour}"></span>{escape(label)}'
+
+
+def _first_pen(pen: dict[str, Pen], estimator: str) -> Pen | None:
+    return pen.get(estimator) or pen.get(f"{estimator} (last)")
+
+
+def number(value: float | None) -> str:
+    """A figure as a reader takes it in: four digits."""
+    return "–" if value is None else f"{value:.4g}"
