@@ -71,14 +71,14 @@ def toy(monkeypatch):
 
     def prepare(log, rig, *, outages=(), without=(), progress=None):
         calls.prepare.append({"rig": rig, "outages": outages, "without": without, "progress": progress})
-        rows = [SimpleNamespace(sensor="prism")]
-        return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, rows=rows, warnings=["imu: 3 samples lost"])
+        return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, samples={}, warnings=["imu: 3 samples lost"])
 
     entry = SimpleNamespace(summary="Smoother.", needs=("imu", "prism"), source="tbmfg")
     names = {"batch": entry, "fixed-lag": entry}
     fakes = SimpleNamespace(ESTIMATORS=names, estimate=lambda *args, **options: calls.estimate(*args, **options))
     calls.estimate = toy_estimate
     fakes.check_switches = lambda rig: None
+    fakes.unmet = lambda name, prepared: None
     monkeypatch.setitem(sys.modules, "tbmfg.estimators", fakes)
     monkeypatch.setitem(sys.modules, "tbmfg.prepare", SimpleNamespace(prepare=prepare))
     monkeypatch.setattr("tbmfg.mcap.read_log", read_log)
