@@ -5,16 +5,17 @@ Heavy imports are inside the commands, so that ``--help`` and completion answer 
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from tbmfg import __version__
-from tbmfg.errors import TbmfgError
+from tbmfg.errors import TbmfgError, reason
 
 app = typer.Typer(
     help="Where is the machine, and how sure are we? Smoothing of recorded underground logs.",
@@ -24,28 +25,57 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-LogPath = Annotated[Path, typer.Argument(metavar="LOG", help="An .mcap file or a rosbag2 folder.", show_default=False)]
-RigName = Annotated[
-    str | None,
-    typer.Option("--rig", metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess."),
-]
-Truth = Annotated[
-    str, typer.Option(metavar="auto|none|TOPIC|FILE", help="Reference to compare with; auto: the rig's, or by name.")
-]
-Output = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")]
-Outages = Annotated[
-    list[str],
-    typer.Option(
-        "--outage", metavar="SENSOR:START:END", help="Hide a sensor; seconds from the first IMU sample. Repeatable."
-    ),
-]
-Without = Annotated[list[str], typer.Option("--without", metavar="SENSOR", help="Drop a sensor. Repeatable.")]
-Only = Annotated[str, typer.Option("--only", metavar="A,B", help="Keep just these sensors and the IMU.")]
-Overrides = Annotated[
-    list[str], typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override a value of the rig. Repeatable.")
-]
+Log = Annotated[str, typer.Argument(metavar="LOG", help="An .mcap file or a rosbag2 folder.", show_default=False)]
+Output = Annotated[str, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")]
+Names = Annotated[str, typer.Option(metavar="A,B,...", help="Names from `tbmfg estimators`.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing results.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def selection(
+    rig: Annotated[
+        str | None,
+        typer.Option(metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess."),
+    ] = None,
+    truth: Annotated[
+        str,
+        typer.Option(metavar="auto|none|TOPIC|FILE", help="Reference to compare with; auto: the rig's, or by name."),
+    ] = "auto",
+    outage: Annotated[
+        list[str],
+        typer.Option(metavar="SENSOR:START:END", help="Hide a sensor; seconds from the first IMU sample. Repeatable."),
+    ] = [],  # noqa: B006 - typer reads defaults, never changes them
+    without: Annotated[list[str], typer.Option(metavar="SENSOR", help="Drop a sensor. Repeatable.")] = [],  # noqa: B006
+    only: Annotated[str, typer.Option(metavar="A,B", help="Keep just these sensors and the IMU.")] = "",
+    overrides: Annotated[
+        list[str],
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override a value of the rig. Repeatable."),
+    ] = [],  # noqa: B006
+) -> dict[str, Any]:
+    """What every command that estimates takes: the options of :func:`tbmfg.pipeline.run`."""
+    return {
+        "rig": rig,
+        "truth": truth,
+        "outages": [parse_outage(text) for text in outage],
+        "without": [name for names in without for name in split_names(names)],
+        "only": split_names(only),
+        "overrides": [checked_override(text) for text in overrides],
+    }
+
+
+def with_selection(command: Callable[..., None]) -> Callable[..., None]:
+    """Give ``command`` the options of :func:`selection`, which it gets parsed as ``options``."""
+    shared = inspect.signature(selection, eval_str=True).parameters
+    own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "options"]
+
+    @functools.wraps(command)
+    def wrapper(**given: Any) -> None:
+        command(options=selection(**{name: given.pop(name) for name in shared}), **given)
+
+    parameters = sorted([*own, *shared.values()], key=lambda p: p.default is not p.empty)  # required ones first
+    wrapper.__signature__ = inspect.Signature(parameters)
+    wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapper
 
 
 def main() -> None:
@@ -68,7 +98,7 @@ def _common(
 
 
 @app.command()
-def info(log: LogPath, debug: Debug = False) -> None:
+def info(log: Log, debug: Debug = False) -> None:
     """Topics, roles, rates, gaps and clock problems of a log."""
     with _errors_in_one_line(debug):
         from tbmfg.mcap import info_text
@@ -78,8 +108,8 @@ def info(log: LogPath, debug: Debug = False) -> None:
 
 @app.command()
 def init(
-    log: LogPath,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
+    log: Log,
+    output: Annotated[str, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     debug: Debug = False,
 ) -> None:
@@ -93,70 +123,92 @@ def init(
 
 
 @app.command()
+@with_selection
 def run(
-    log: LogPath,
+    log: Log,
     output: Output,
-    rig: RigName = None,
+    options: dict[str, Any],
     estimator: Annotated[str, typer.Option(metavar="NAME", help="See `tbmfg estimators`.")] = "batch",
-    truth: Truth = "auto",
-    outage: Outages = [],  # noqa: B006 - typer reads defaults, never changes them
-    without: Without = [],  # noqa: B006
-    only: Only = "",
-    overrides: Overrides = [],  # noqa: B006
     report: Annotated[bool, typer.Option("--report", help="Write report.html too.")] = False,
     force: Force = False,
     debug: Debug = False,
 ) -> None:
     """Estimate the trajectory of one log and write it to a folder."""
-    options = _options(outage, without, only, overrides)
-    _known(estimator, "--estimator")
+    _known([estimator], "--estimator")
     with _errors_in_one_line(debug):
         from tbmfg import pipeline
 
-        with _progress_bar() as progress:
+        with _progress_bar("reading") as progress:
             summary = pipeline.run(
-                log,
-                rig=rig,
-                estimator=estimator,
-                truth=truth,
-                output=output,
-                report=report,
-                force=force,
-                progress=progress,
-                **options,
+                log, estimator=estimator, output=output, report=report, force=force, progress=progress, **options
             )
         _print_summary(summary, output)
 
 
 @app.command()
+@with_selection
 def compare(
-    log: LogPath,
+    log: Log,
     output: Output,
-    rig: RigName = None,
-    estimators: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Names from `tbmfg estimators`.")
-    ] = "batch,fixed-lag,ins",
-    truth: Truth = "auto",
-    outage: Outages = [],  # noqa: B006
-    without: Without = [],  # noqa: B006
-    only: Only = "",
-    overrides: Overrides = [],  # noqa: B006
+    options: dict[str, Any],
+    estimators: Names = "batch,fixed-lag,ins",
     force: Force = False,
     debug: Debug = False,
 ) -> None:
     """Run several estimators on one prepared log, side by side."""
-    options = _options(outage, without, only, overrides)
     names = split_names(estimators)
-    for name in names:
-        _known(name, "--estimators")
+    _known(names, "--estimators")
     with _errors_in_one_line(debug):
         from tbmfg import pipeline
 
-        with _progress_bar() as progress:
+        with _progress_bar("reading") as progress:
             summaries = pipeline.compare(
-                log, rig=rig, estimators=names, truth=truth, output=output, force=force, progress=progress, **options
+                log, estimators=names, output=output, force=force, progress=progress, **options
             )
         _print_comparison(summaries, output)
+
+
+@app.command()
+@with_selection
+def batch(
+    logs: Annotated[
+        list[str], typer.Argument(metavar="LOG|DIR|GLOB|URL...", help="Logs, and folders of logs.", show_default=False)
+    ],
+    output: Output,
+    options: dict[str, Any],
+    estimator: Annotated[str, typer.Option(metavar="NAME", help="One estimator, its files in DIR/LOG.")] = "batch",
+    estimators: Annotated[str, typer.Option(metavar="A,B,...", help="Several, each in DIR/LOG/NAME.")] = "",
+    jobs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Logs at a time; else one per processor.", show_default=False)
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="Run on the workers of this Dask scheduler.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace results of other inputs.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Estimate many logs, each in a process of its own; finished ones are kept when started again.
+
+    Exit code 0: every log is done; 1: at least one failed, the others are done and batch.json says which.
+    """
+    names = split_names(estimators) or [estimator]
+    _known(names, "--estimators" if estimators else "--estimator")
+    with _errors_in_one_line(debug):
+        from tbmfg import batch as many
+
+        with _progress_bar("logs") as progress:
+
+            def tell(outcome: Any, number: int, total: int) -> None:
+                _print_outcome(outcome, number, total)
+                if progress:
+                    progress(f"{number} of {total} logs", number / total)
+
+            report = many.run(
+                logs, output=output, estimators=names, jobs=jobs, scheduler=scheduler, force=force, tell=tell, **options
+            )
+        _print_batch(report, output)
+    if report[many.FAILED]:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -172,22 +224,13 @@ def estimators(debug: Debug = False) -> None:
 # ---- reading options ----
 
 
-def _options(outage: list[str], without: list[str], only: str, overrides: list[str]) -> dict[str, Any]:
-    """What ``run`` and ``compare`` share, parsed."""
-    return {
-        "outages": [parse_outage(text) for text in outage],
-        "without": [name for names in without for name in split_names(names)],
-        "only": split_names(only),
-        "overrides": [checked_override(text) for text in overrides],
-    }
-
-
-def _known(estimator: str, hint: str) -> None:
+def _known(estimators: list[str], hint: str) -> None:
     """Refuse a name that no estimator has."""
     from tbmfg.estimators import ESTIMATORS
 
-    if estimator not in ESTIMATORS:
-        raise typer.BadParameter(f"no {estimator!r}; there are {', '.join(ESTIMATORS)}", param_hint=hint)
+    for name in estimators:
+        if name not in ESTIMATORS:
+            raise typer.BadParameter(f"no {name!r}; there are {', '.join(ESTIMATORS)}", param_hint=hint)
 
 
 def parse_outage(text: str) -> tuple[str, float, float]:
@@ -228,32 +271,32 @@ def _errors_in_one_line(debug: bool) -> Iterator[None]:
             import traceback
 
             traceback.print_exc()
-        elif isinstance(error, TbmfgError | OSError):
-            typer.echo(f"tbmfg: {error}", err=True)
         else:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            typer.echo(f"tbmfg: internal error: {reason}; rerun with --debug for the traceback", err=True)
+            foreseen = isinstance(error, TbmfgError | OSError)
+            typer.echo(
+                f"tbmfg: {reason(error)}{'' if foreseen else '; rerun with --debug for the traceback'}", err=True
+            )
         raise typer.Exit(1) from None
 
 
 @contextmanager
-def _progress_bar() -> Iterator[Callable[[str, float], None] | None]:
-    """A callback that draws stage and fraction on a terminal; None in a pipe."""
+def _progress_bar(first: str) -> Iterator[Callable[[str, float], None] | None]:
+    """A callback that draws stage (at the beginning ``first``) and fraction on a terminal; None in a pipe."""
     if not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=1.0)
+    with Progress(console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty()) as bar:
+        task = bar.add_task(first, total=1.0)
         yield lambda stage, fraction: bar.update(task, description=stage, completed=fraction)
 
 
 # ---- printing ----
 
 
-def _print_summary(summary: dict[str, Any], output: Path) -> None:
+def _print_summary(summary: dict[str, Any], output: str) -> None:
     typer.echo(
         f"{summary['estimator']}: {summary['keyframes']} keyframes over {summary['duration_s']:.1f} s"
         f" in {summary['wall_s']:.1f} s ({summary['realtime_factor']:.1f} x real time)"
@@ -283,7 +326,7 @@ def _print_summary(summary: dict[str, Any], output: Path) -> None:
     typer.echo(f"results: {output}")
 
 
-def _print_comparison(summaries: dict[str, dict[str, Any]], output: Path) -> None:
+def _print_comparison(summaries: dict[str, dict[str, Any]], output: str) -> None:
     """One row per trajectory: an online solver has a causal one and its last estimates."""
     from tbmfg import comparison
     from tbmfg.results import REPORT
@@ -300,11 +343,42 @@ def _print_comparison(summaries: dict[str, dict[str, Any]], output: Path) -> Non
     if first["metrics"] is not None:
         typer.echo(f"against {first['truth']}; NEES of a consistent estimator: {first['metrics']['nees_dof']}")
     typer.echo(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
-    for name, reason in comparison.not_run(summaries).items():
-        typer.echo(f"{name} not run: {reason}")
+    for name, why in comparison.not_run(summaries).items():
+        typer.echo(f"{name} not run: {why}")
     for warning in dict.fromkeys(warning for summary in ran.values() for warning in summary["warnings"]):
         typer.echo(f"warning: {warning}")
-    typer.echo(f"results: {output}, to read: {output / REPORT}")
+    typer.echo(f"results: {output}, to read: {output}/{REPORT}")
+
+
+def _print_outcome(outcome: Any, number: int, total: int) -> None:
+    """The line of one log, when it has ended."""
+    first = next((result for result in outcome.results if "not_run" not in result), None)
+    spent = f", {first['duration_s']:.1f} s in {first['wall_s']:.1f} s" if first and outcome.status == "done" else ""
+    typer.echo(f"[{number}/{total}] {outcome.name}: {outcome.reason or outcome.status}{spent}")
+
+
+def _print_batch(report: dict[str, Any], output: str) -> None:
+    """One row per log and estimator; logs that failed below."""
+    rows = []
+    for log in report["logs"]:
+        for result in log["results"]:
+            ran = "not_run" not in result
+            columns = ("keyframes", "duration_s", "realtime_factor", "warnings", "ape_rms_m", "attitude_rms_deg")
+            shown = (_number(result[name]) for name in columns) if ran else ("-" for _ in columns)
+            rows.append((log["name"], result["estimator"], log["status"], *shown))
+    titles = ["log", "estimator", "status", "keyframes", "s", "x real time", "warnings", "APE m", "attitude deg"]
+    _print_table(titles, rows, justify="right")
+    for log in report["logs"]:
+        if log["status"] == "failed":
+            typer.echo(f"failed: {log['log']}: {log['reason']}")
+        for result in log["results"]:
+            if "not_run" in result:
+                typer.echo(f"{log['name']}: {result['estimator']} not run: {result['not_run']}")
+    typer.echo(
+        f"{report['done']} done, {report['kept']} kept from before, {report['failed']} failed"
+        f" of {report['logs_found']} logs in {report['wall_s']:.1f} s"
+    )
+    typer.echo(f"results: {output}")
 
 
 def _print_table(header: list[str], rows: list[tuple[str, ...]], *, justify: str = "left") -> None:

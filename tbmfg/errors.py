@@ -18,3 +18,11 @@ class RigError(TbmfgError):
 
 class EstimationError(TbmfgError):
     """A problem that the log and the rig do not determine; the message says which and what would."""
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong, in one line; of what nobody foresaw also its kind."""
+    text = " ".join(str(error).split())
+    if isinstance(error, TbmfgError | OSError):
+        return text
+    return f"internal error: {type(error).__name__}: {text}"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tbmfg import __version__
+from tbmfg import __version__, storage
 from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.results import (
     REPORT,
@@ -32,6 +32,7 @@ from tbmfg.timeseries import NS, Log
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
     from tbmfg.report import Report
+    from tbmfg.storage import Place
 
 Progress = Callable[[str, float], None]
 Outage = tuple[str, float, float]
@@ -123,7 +124,7 @@ class Session:
 
 
 def open_session(
-    log_path: str | Path,
+    log_path: str | Place,
     *,
     rig: Rig | str | Path | None = None,
     truth: str = "auto",
@@ -155,10 +156,10 @@ def open_session(
 
 
 def run(
-    log_path: str | Path,
+    log_path: str | Place,
     *,
     estimator: str = "batch",
-    output: str | Path | None = None,
+    output: str | Place | None = None,
     report: bool = False,
     force: bool = False,
     progress: Progress | None = None,
@@ -188,10 +189,10 @@ def run(
 
 
 def compare(
-    log_path: str | Path,
+    log_path: str | Place,
     *,
     estimators: Sequence[str],
-    output: str | Path | None = None,
+    output: str | Place | None = None,
     force: bool = False,
     progress: Progress | None = None,
     **options: Any,
@@ -205,10 +206,11 @@ def compare(
 
     known_estimators(estimators)
     if output is not None:
+        output = storage.place(output)
         for name in (COMPARISON, REPORT):
-            refuse_existing_file(Path(output) / name, force)
+            refuse_existing_file(output / name, force)
         for name in estimators:
-            refuse_existing(Path(output) / name, force)
+            refuse_existing(output / name, force)
     session = open_session(log_path, progress=progress, **options)
     summaries: dict[str, dict[str, Any]] = {}
     report = session.report()
@@ -224,12 +226,12 @@ def compare(
         elif output is not None:
             report.add(result, summaries[name], session.truth(result))
             rig = dump_rig(session.prepared.rig)
-            write_result(Path(output) / name, result, summaries[name], rig, force=force)
+            write_result(output / name, result, summaries[name], rig, force=force)
     if all("not_run" in summary for summary in summaries.values()):
         raise TbmfgError(f"{log_path}: none ran: " + "; ".join(f"{k}: {v['not_run']}" for k, v in summaries.items()))
     if output is not None:
-        write_text(Path(output) / REPORT, report.html(), force=force)
-        write_text(Path(output) / COMPARISON, to_json(summaries), force=force)
+        write_text(output / REPORT, report.html(), force=force)
+        write_text(output / COMPARISON, to_json(summaries), force=force)
     return summaries
 
 
@@ -262,12 +264,12 @@ def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = (
     return override(rig, overrides) if overrides else rig, assumed
 
 
-def init(log_path: str | Path, output: str | Path, *, force: bool = False) -> list[str]:
+def init(log_path: str | Place, output: str | Place, *, force: bool = False) -> list[str]:
     """Write a starter rig for a log to the file ``output`` and return what was assumed in it, line by line."""
     from tbmfg.inference import infer, starter
     from tbmfg.mcap import read_log
 
-    output = Path(output)
+    output = storage.place(output)
     refuse_existing_file(output, force)
     log = read_log(log_path)
     inferred = infer(log)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -15,6 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from tbmfg import storage
 from tbmfg.errors import TbmfgError
 from tbmfg.geometry import matrix_from_quat
 from tbmfg.state import Innovations, Result, Trajectory, Truth
@@ -22,6 +21,7 @@ from tbmfg.timeseries import NS, Floats, Log, Series, Times
 
 if TYPE_CHECKING:
     from tbmfg.rig import Rig
+    from tbmfg.storage import Place
 
 NIS_BINS = 60  # stretches of time that a summary gives the innovations in
 SUMMARY = "summary.json"
@@ -33,9 +33,9 @@ FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result
 # ---- a result folder ----
 
 
-def refuse_existing(output: str | Path, force: bool) -> None:
+def refuse_existing(output: str | Place, force: bool) -> None:
     """Raise unless a result may be written to the folder ``output``."""
-    output = Path(output)
+    output = storage.place(output)
     if output.exists() and not output.is_dir():
         raise TbmfgError(f"{output}: is a file; -o wants a folder")
     existing = [name for name in FILES if (output / name).exists()]
@@ -43,18 +43,15 @@ def refuse_existing(output: str | Path, force: bool) -> None:
         raise TbmfgError(f"{output}: already holds {', '.join(existing)}; give another folder, or --force to replace")
 
 
-def write_text(path: str | Path, text: str, *, force: bool = False) -> None:
+def write_text(path: str | Place, text: str, *, force: bool = False) -> None:
     """Write one text file, which appears under its name when complete; raises where it exists without ``force``."""
-    from tbmfg.mcap.writer import replacing
-
     refuse_existing_file(path, force)
-    with replacing(Path(path)) as temporary:
-        temporary.write_text(text, "utf-8")
+    storage.write_text(storage.place(path), text)
 
 
-def refuse_existing_file(path: str | Path, force: bool) -> None:
+def refuse_existing_file(path: str | Place, force: bool) -> None:
     """Raise unless the file ``path`` may be written."""
-    path = Path(path)
+    path = storage.place(path)
     if path.is_dir():
         raise TbmfgError(f"{path}: is a folder; -o wants a file here")
     if path.exists() and not force:
@@ -62,7 +59,7 @@ def refuse_existing_file(path: str | Path, force: bool) -> None:
 
 
 def write_result(
-    output: str | Path,
+    output: str | Place,
     result: Result,
     summary: dict[str, Any],
     rig_yaml: str,
@@ -70,10 +67,10 @@ def write_result(
     report: str | None = None,
     force: bool = False,
 ) -> None:
-    """Write every file of ``result`` to the folder ``output``, which is made where it is missing; ``report`` is a page.
+    """Write every file of ``result`` to the folder ``output``, a path or a URL, which is made where it is missing;
+    ``report`` is a page.
 
-    The files are written under a hidden folder inside ``output`` (so on the same file system) and moved
-    to their names when all are complete.
+    The files are written elsewhere and come to their names when all are complete.
     """
     from tbmfg.mcap import write_trajectory
 
@@ -88,29 +85,22 @@ def write_result(
         (folder / SUMMARY).write_text(to_json(summary), "utf-8")
 
     refuse_existing(output, force)
-    write_atomically(Path(output), FILES, write)
+    write_atomically(storage.place(output), FILES, write)
 
 
-def write_atomically(output: Path, names: Iterable[str], write: Callable[[Path], None]) -> None:
+def write_atomically(output: Place, names: Iterable[str], write: Callable[[Path], None]) -> None:
     """Run ``write`` on a scratch folder, then move what it wrote to ``output``, in the order of ``names``.
 
     Files of ``names`` that were there before and are not written again are removed, the last name first.
     """
-    made = not output.exists()
-    output.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".partial-", dir=output))
-    try:
+    with storage.scratch_for(output) as scratch:
         write(scratch)
         names = tuple(names)
         for name in reversed(names):
             (output / name).unlink(missing_ok=True)
         for name in names:
             if (scratch / name).exists():
-                (scratch / name).replace(output / name)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-        if made and not any(output.iterdir()):
-            output.rmdir()
+                storage.publish(scratch / name, output / name)
 
 
 def _write_trajectory_files(folder: Path, tum: str, npz: str, trajectory: Trajectory) -> None:

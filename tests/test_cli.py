@@ -171,7 +171,7 @@ def test_progress_is_drawn_on_a_terminal_only(toy, tmp_path, monkeypatch):
     assert toy.prepare[0]["progress"] is None
     assert ran.stderr == ""
     monkeypatch.setattr(cli.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=len, flush=lambda: None))
-    with cli._progress_bar() as progress:
+    with cli._progress_bar("reading") as progress:
         progress("solving", 0.5)
 
 

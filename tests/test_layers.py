@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 # Each module or package sees those of the lines above, never one of its own line.
 LEVELS = (
     ("errors",),
-    ("timeseries", "yamltext"),
+    ("timeseries", "yamltext", "storage", "workers"),
     ("geometry", "earth", "fields"),
     ("state", "rig"),
     ("sensors", "mcap", "inertial", "lidar", "evaluation"),
@@ -22,7 +22,8 @@ LEVELS = (
     ("outcome",),
     ("prepare",),
     ("estimators", "bounds", "report"),
-    ("pipeline", "batch"),
+    ("pipeline",),
+    ("batch",),
     ("cli",),
     ("__main__",),
 )

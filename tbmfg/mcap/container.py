@@ -8,7 +8,6 @@ import zlib
 from bisect import bisect_right
 from collections.abc import Iterator
 from io import BytesIO
-from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Footer, Schema
 
 from tbmfg.errors import LogError
+from tbmfg.storage import Place, place
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -54,20 +54,24 @@ class McapFile:
     Raises LogError where this is not an MCAP file or cannot be opened.
     """
 
-    def __init__(self, path: str | os.PathLike) -> None:
+    def __init__(self, path: str | os.PathLike | Place) -> None:
+        path = place(path)
         self.path = str(path)
-        self.name = Path(path).name
+        self.name = path.name
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.attachments: dict[str, bytes] = {}
         self.damage: list[str] = []
         self.position = 0
         try:
-            self._file = open(path, "rb")  # noqa: SIM115 (closed by __exit__)
-            self.size = os.fstat(self._file.fileno()).st_size
+            self._file = path.open("rb")
+            self.size = self._file.seek(0, os.SEEK_END)
+            self._file.seek(0)
             start = self._file.read(16)
         except OSError as error:
-            raise LogError(f"{path}: cannot be read ({error.strerror}); check the name and its permissions") from None
+            raise LogError(
+                f"{path}: cannot be read ({error.strerror or error}); check the name and its permissions"
+            ) from None
         if not start.startswith(MAGIC):
             self._file.close()
             if not start:

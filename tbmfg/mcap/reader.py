@@ -7,7 +7,7 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import PurePosixPath
 
 import yaml
 from mcap.opcode import Opcode
@@ -20,6 +20,7 @@ from tbmfg.mcap.layouts import LAYOUTS
 from tbmfg.mcap.schemas import full_name
 from tbmfg.mcap.stamps import eras
 from tbmfg.mcap.streams import TRANSFORMS, CloudStream, Entries, SeriesStream, Stream, TransformStream
+from tbmfg.storage import Place, is_folder, place
 from tbmfg.timeseries import Log
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -58,7 +59,7 @@ def read_log(
     *,
     progress: Callable[[float], None] | None = None,
 ) -> Log:
-    """A recording in columns: ``path`` is an .mcap file, or a rosbag2 folder with metadata.yaml.
+    """A recording in columns: ``path`` is an .mcap file or a rosbag2 folder with metadata.yaml, here or at a URL.
 
     With ``topics`` only these become series and clouds; static transforms and attachments are always read.
     ``progress`` is called with the fraction done, 0 to 1. Damaged parts are skipped and described in
@@ -99,10 +100,10 @@ def scan(
     return recording
 
 
-def recording_files(path: str | os.PathLike) -> list[Path]:
+def recording_files(path: str | os.PathLike | Place) -> list[Place]:
     """The MCAP files of a recording in order. Raises LogError for a folder that is not a rosbag2 recording."""
-    path = Path(path)
-    if not path.is_dir():
+    path = place(path)
+    if not is_folder(path):
         return [path]
     metadata = path / "metadata.yaml"
     if not metadata.is_file():
@@ -123,7 +124,7 @@ def recording_files(path: str | os.PathLike) -> list[Path]:
     if not names:
         raise LogError(f"{metadata}: names no files; rebuild it with: ros2 bag reindex")
     # Early rosbag2 wrote the folder's own name into the paths.
-    return [path / name if (path / name).exists() else path / Path(name).name for name in names]
+    return [path / name if (path / name).exists() else path / PurePosixPath(name).name for name in names]
 
 
 class _Distributor:
