@@ -18,4 +18,5 @@ from __future__ import annotations
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "speed": "benchmarks.speed",
+    "papers": "benchmarks.papers",
 }

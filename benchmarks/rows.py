@@ -76,17 +76,20 @@ def print_tables(rows: list[Row]) -> None:
 
 
 def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of one scenario. Estimators share a line where unit, bound and published value agree."""
+    """Header and lines of one scenario. Estimators share a line where unit, number and bound agree; what is published
+    stands in a line below."""
     estimators = list(dict.fromkeys(row.estimator for row in rows))
-    published = any(row.published is not None for row in rows)
     cells: dict[tuple, dict[str, Row]] = {}
     for row in rows:
-        cells.setdefault((row.metric, row.unit, row.n, row.bound, row.published), {})[row.estimator] = row
+        cells.setdefault((row.metric, row.unit, row.n, row.bound), {})[row.estimator] = row
     lines = []
-    for (metric, unit, n, bound, reported), by_estimator in cells.items():
-        line = [metric, unit, *(_cell(by_estimator.get(name)) for name in estimators), str(n), _bound(bound)]
-        lines.append(line + ([_number(reported)] if published else []))
-    return ["metric", "unit", *estimators, "n", "bound"] + ["published"] * published, lines
+    for (metric, unit, n, bound), by_estimator in cells.items():
+        lines.append([metric, unit, *(_cell(by_estimator.get(name)) for name in estimators), str(n), _bound(bound)])
+        published = {name: row.published for name, row in by_estimator.items() if row.published is not None}
+        if published:
+            reported = (_number(published[name]) if name in published else "" for name in estimators)
+            lines.append(["  published", unit, *reported, "", ""])
+    return ["metric", "unit", *estimators, "n", "bound"], lines
 
 
 def _cell(row: Row | None) -> str:

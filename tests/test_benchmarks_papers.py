@@ -1,0 +1,155 @@
+"""The papers' experiments: comparisons on numbers whose answer is known, how faults are judged, and a tiny run."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import datasets
+from benchmarks.__main__ import main
+from benchmarks.papers import shearer
+from benchmarks.papers.trials import Method, Outcome, Outcomes, confidence
+from benchmarks.rows import read_rows
+from tbmfg.evaluation.metrics import chi_square_bounds
+from tbmfg.state import Innovations, Interval
+
+ERRORS = {"plain": [10.0, 12.0, 8.0, 11.0], "better": [4.0, 5.0, 3.5, 5.5], "best": [2.0, 2.5, 1.5, 2.0]}
+
+
+@pytest.fixture
+def ladder():
+    """Three methods on four logs."""
+    nees = (6.0, 12.0, 6.0)
+    return Outcomes(
+        [
+            Outcome("cut", method, seed, {"max": (value, "m")}, (10.0, 20.0, 30.0), nees)
+            for method, values in ERRORS.items()
+            for seed, value in enumerate(values)
+        ]
+    )
+
+
+# ---- comparisons ----
+
+
+def test_rows_hold_means_what_is_published_and_consistency(ladder):
+    rows = {row.key: row for row in ladder.rows("cut", {("better", "max"): 9.0}, {"max": (None, 5.0)})}
+    better = rows["cut", "better", "max"]
+    assert (better.mean, better.published, better.n, better.inside) == (4.5, 9.0, 4, True)
+    assert not rows["cut", "plain", "max"].inside
+    assert rows["cut", "better", "max / published"].mean == 0.5
+    assert ("cut", "best", "max / published") not in rows
+    assert rows["cut", "best", "failed"].mean == 0
+    nees = rows["cut", "best", "nees_pose@20s"]
+    assert nees.mean == 2.0
+    # one false alarm in a hundred is shared by three epochs of three methods
+    assert nees.bound == pytest.approx(tuple(np.array(chi_square_bounds(4, 6, 0.01 / 9)) / 6))
+
+
+def test_reductions_and_ordering(ladder):
+    assert ladder.reduction("cut", "better", "plain", "max", 60.0).mean == pytest.approx(100 * (1 - 18.0 / 41.0))
+    assert ladder.ordering("cut", ["plain", "better", "best"], "max").inside
+    assert not ladder.ordering("cut", ["plain", "best", "better"], "max").inside
+
+
+def test_pairs_are_compared_log_by_log(ladder):
+    mean, low, high = ladder.paired("cut", "best", "better", "max")
+    gain = np.array(ERRORS["better"]) - np.array(ERRORS["best"])
+    assert mean.mean == pytest.approx(gain.mean())
+    reach = 3.182446 * gain.std(ddof=1) / 2.0  # Student's t with 3 degrees of freedom, two-sided 95 %
+    assert (low.mean, high.mean) == pytest.approx((gain.mean() - reach, gain.mean() + reach), rel=1e-6)
+    assert low.inside
+    assert not ladder.paired("cut", "better", "best", "max")[1].inside
+    lone = Outcomes([one for one in ladder.outcomes if one.method != "best" or one.seed == 0])
+    assert lone.paired("cut", "best", "better", "max") == []
+
+
+def test_confidence_interval_holds_the_mean_as_often_as_it_says():
+    draws = np.random.default_rng(1).standard_normal((4000, 6)) + 3.0
+    inside = np.mean([low < 3.0 < high for low, high in map(confidence, draws)])
+    assert inside == pytest.approx(0.95, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
+
+
+def test_failed_logs_are_counted_and_left_out(ladder):
+    outcomes = Outcomes([*ladder.outcomes, Outcome("cut", "plain", 4, {}, failure="not determined")])
+    rows = {row.key: row for row in outcomes.rows("cut", {}, {})}
+    assert (rows["cut", "plain", "failed"].mean, rows["cut", "plain", "failed"].inside) == (1, False)
+    assert rows["cut", "plain", "max"].n == 4
+    assert outcomes.paired("cut", "better", "plain", "max")[0].n == 4
+
+
+# ---- magnetic faults ----
+
+
+def seen(simulation, gated, intervals=()):
+    """A result of an estimator that sets samples ``gated`` (n,) aside and names ``intervals`` (start, end) in s."""
+    t_ns = simulation.clean["magnetometer"].t_ns
+    named = [Interval("magnetometer", "gated", *(simulation.start_ns + round(t * 1e9) for t in s)) for s in intervals]
+    return SimpleNamespace(
+        estimator="batch",
+        trajectory=SimpleNamespace(t_ns=t_ns),
+        intervals=[Interval("odometer", "gated", simulation.start_ns, simulation.start_ns + 85 * 10**9), *named],
+        innovations={"magnetometer": Innovations(t_ns, np.zeros(len(t_ns)), 1, gated)},
+    )
+
+
+@pytest.fixture(scope="module", params=["offset", "spikes"])
+def disturbed(request):
+    return request.param, datasets.make("shearer-magfault", seed=1, duration=40.0, fault=request.param)
+
+
+def test_what_is_seen_of_a_fault_is_judged_by_what_was_done(disturbed, monkeypatch):
+    fault, simulation = disturbed
+    monkeypatch.setattr(shearer, "errors", lambda *_: {})
+    count = len(simulation.clean["magnetometer"])
+    told = simulation.drawn["magnetometer"]
+    if fault == "spikes":
+        clear = np.abs(told["fault_yaw_deg"]) > 5 * 0.5
+        half = clear & (np.cumsum(clear) % 2 == 0)
+        found = shearer.fault_errors(simulation, seen(simulation, half), None)
+        assert found["spikes_found"][0] == pytest.approx(50.0, abs=100.0 / clear.sum())
+        assert found["sound_gated"][0] == 0.0
+        return
+    gated = np.zeros(count, dtype=bool)
+    gated[:50] = True  # the first five of the twenty sound seconds
+    # two pieces that lie close together are one stretch; another far away is not
+    result = seen(simulation, gated, [(11.0, 18.0), (18.4, 29.0), (2.0, 5.0)])
+    found = shearer.fault_errors(simulation, result, None)
+    # 20 degrees within a second: 3 sds of 0.5 degrees are first exceeded at 10.1 s, last at 29.9 s
+    assert found["fault_start"][0] == pytest.approx(0.9)
+    assert found["fault_end"][0] == pytest.approx(0.9)
+    assert found["sound_gated"][0] == pytest.approx(100.0 * 50 / 200, abs=0.5)
+    nothing = shearer.fault_errors(simulation, seen(simulation, gated), None)
+    assert nothing["fault_start"][0] > 20.0
+
+
+# ---- the command ----
+
+
+@pytest.mark.slow
+def test_shearer_paper_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(shearer, "ALL", shearer.FEW)
+    monkeypatch.setattr(shearer, "ABLATION", tuple(Method(name, name) for name in ("shearer-ckf", "shearer-afkf")))
+    monkeypatch.setattr(shearer, "SCALES", {})
+    out = tmp_path / "rows.json"
+    assert (
+        main(["papers", "--paper", "shearer", "--seeds", "2", "--duration", "12", "--jobs", "1", "--json", str(out)])
+        == 0
+    )
+    rows = {row.key: row for row in read_rows(out)}
+    assert {key[0] for key in rows} == {"nominal", "aligned", "mti30=printed", "offset", "field", "spikes"}
+    assert all(row.mean == 0 for row in rows.values() if row.metric == "failed")
+    assert rows["nominal", "shearer-sins", "max_east"].published == 3.9664
+    assert rows["nominal", "shearer-ckf", "max_north less than shearer-sins-od"].published == 74.01
+    assert rows["offset", "shearer-afkf", "max_east less than shearer-ckf"].published == 59.6
+    # 20 degrees are felt within the second and a half that they are there
+    yaw = {scenario: rows[scenario, "shearer-ckf", "rms_yaw"].mean for scenario in ("nominal", "offset")}
+    assert yaw["offset"] > 2 * yaw["nominal"]
+    assert "nees_pose@12s" in capsys.readouterr().out
+
+
+def test_wrong_papers_and_numbers_are_refused(capsys):
+    assert main(["papers", "--seeds", "0"]) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+    with pytest.raises(SystemExit):
+        main(["papers", "--paper", "moon"])
