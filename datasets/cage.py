@@ -1,8 +1,9 @@
 """The attitude unit of the shaft boring machine on a cage that goes down a shaft 430 m deep (sbm, section 8).
 
-It speeds up over 15 s, goes on at 3.90 m/s to the bottom or at 1.33 m/s for 300 s, and slows down over 15 s. The guide
-rails shake it, the more the faster it goes. There is no laser on board: depth comes from the barometer alone, and how
-warm the air in the shaft is, is not known to better than ``air_sd_k``, which cannot be told from a scale of depth.
+It stands, speeds up over 15 s, goes on at 3.90 m/s to the bottom or at 1.33 m/s for 300 s, slows down over 15 s, and
+stands. The guide rails shake it, the more the faster it goes. There is no laser on board: depth comes from the
+barometer, and how warm the air in the shaft is, is not known to better than ``air_sd_k``, which cannot be told from a
+scale of depth. ``survey_sd_m`` above 0 puts a surveyed position at the log's end into the rig, a depth known so well.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ import numpy as np
 from datasets import shaft
 from datasets.motion import Lines, Motion, Spline, integral, lines, smooth_step
 from datasets.simulate import Simulation, stream
-from tbmfg.rig import Rig, override
+from tbmfg.rig import Rig, SurveyPoint, override
 from tbmfg.timeseries import Floats
 
 RAMP_S = 15.0
 FAST_MPS, SLOW_MPS = 3.90, 1.33
-FAST_S = 430.0 / FAST_MPS + RAMP_S  # to the bottom: 95.3 s between the ramps
-SLOW_S = 300.0 + 2 * RAMP_S
+STAND_S = 5.0  # at both ends
+FAST_S = 430.0 / FAST_MPS + RAMP_S + 2 * STAND_S  # to the bottom: 95.3 s between the ramps
+SLOW_S = 300.0 + 2 * RAMP_S + 2 * STAND_S
 
 
 def rig() -> Rig:
     """The shaft boring machine's rig without its laser, free to go down the shaft."""
-    machine = override(shaft.rig(), ["motion.radius_m=450", "motion.speed_mps=4", "keyframes.max_gap_s=0.2"])
+    machine = override(shaft.rig(), ["motion.radius_m=450", "motion.speed_mps=4", "keyframes.max_gap_s=0.5"])
     kept = {name: sensor for name, sensor in machine.sensors.items() if name != "laser"}
     return machine.model_copy(update={"sensors": kept, "name": "cage"})
 
@@ -35,10 +37,11 @@ def fast(
     duration: float = FAST_S,
     vibration: float = 1.0,
     air_sd_k: float = 2.0,
+    survey_sd_m: float = 0.0,
     nominal: int = 0,
 ) -> Simulation:
     """A cage going down 430 m at 3.90 m/s."""
-    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, vibration, air_sd_k, nominal)
+    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, vibration, air_sd_k, survey_sd_m, nominal)
 
 
 def slow(
@@ -48,10 +51,11 @@ def slow(
     duration: float = SLOW_S,
     vibration: float = 1.0,
     air_sd_k: float = 2.0,
+    survey_sd_m: float = 0.0,
     nominal: int = 0,
 ) -> Simulation:
     """A cage going down 419 m at 1.33 m/s."""
-    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, vibration, air_sd_k, nominal)
+    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, vibration, air_sd_k, survey_sd_m, nominal)
 
 
 def ride(
@@ -63,19 +67,24 @@ def ride(
     duration: float,
     vibration: float,
     air_sd_k: float,
+    survey_sd_m: float,
     nominal: int,
 ) -> Simulation:
-    """Down at ``speed_mps``, standing after ``whole_s``."""
+    """Down at ``speed_mps`` within ``whole_s``."""
     t_s = shaft.times(duration)
     speed = pace(t_s, speed_mps, whole_s)
     shaking = rails(t_s, vibration * (not nominal) * speed, stream(seed, "vibration"))
     motion = Motion(down(t_s, speed), (shaking,))
+    if survey_sd_m:
+        end = motion(np.array([duration])).position[0] + survey_sd_m * stream(seed, "survey").standard_normal(3)
+        mark = SurveyPoint(at="end", position_m=tuple(end.tolist()), sigma_m=survey_sd_m)
+        machine = machine.model_copy(update={"survey": (mark,)})
     return shaft.record(name, motion, machine, seed, duration, 0.0, 0.0, air_sd_k, nominal, without="laser")
 
 
 def pace(t_s: Floats, speed_mps: float, whole_s: float) -> Floats:
-    """Speed of a ride of ``whole_s``, m/s, (n,)."""
-    return speed_mps * smooth_step(t_s / RAMP_S) * smooth_step((whole_s - t_s) / RAMP_S)
+    """Speed of a ride that ends, standing, at ``whole_s``; m/s, (n,)."""
+    return speed_mps * smooth_step((t_s - STAND_S) / RAMP_S) * smooth_step((whole_s - STAND_S - t_s) / RAMP_S)
 
 
 def down(t_s: Floats, speed: Floats) -> Spline:

@@ -218,10 +218,20 @@ def test_sinking_machine_goes_where_it_points_and_stays_on_its_laser(seed):
 def test_cage_goes_down_as_far_as_the_spec_says(name, speed, length_m):
     whole = datasets.own_duration(name)
     t_s = shaft.times(whole)
-    position, velocity, _ = cage.down(t_s, cage.pace(t_s, speed, whole))(np.array([0.0, 15.0, whole - 15.0, whole]))
+    position, velocity, _ = cage.down(t_s, cage.pace(t_s, speed, whole))(np.array([5.0, 20.0, whole - 20.0, whole]))
     assert position[0, 2] - position[-1, 2] == pytest.approx(length_m, abs=1e-6)
     assert_allclose(velocity[:, 2], [0.0, -speed, -speed, 0.0], atol=1e-6)
     assert position[1, 2] == pytest.approx(-7.5 * speed, abs=1e-5)  # half of the way at full speed
+
+
+def test_cage_knows_the_depth_that_was_surveyed():
+    simulation = datasets.make("cage-fast", seed=1, duration=30.0, vibration=0.0, survey_sd_m=0.05)
+    [mark] = simulation.rig.survey
+    error = np.array(mark.position_m) - simulation.truth(np.array([30.0])).position[0]
+    assert mark.at == "end"
+    assert mark.sigma_m == 0.05
+    assert 0.0 < np.abs(error).max() < 4 * 0.05
+    assert not made("cage-fast", duration=40.0, vibration=0.0).rig.survey
 
 
 # ---- the logs as a whole ----
@@ -252,7 +262,7 @@ def test_own_lengths():
     lengths = {name: datasets.own_duration(name) for name in SHAFT}
     expected = {"static": 40, "low": 40, "high": 40, "dynamic": 80, "descend": 180}
     assert lengths == {f"shaft-{key}": value for key, value in expected.items()} | {
-        "cage-fast": pytest.approx(125.26, abs=0.01),
-        "cage-slow": 330,
+        "cage-fast": pytest.approx(135.26, abs=0.01),
+        "cage-slow": 340,
     }
     assert log_of(made("shaft-static"), "/imu/data").t_ns[-1] - made("shaft-static").start_ns == 40_000_000_000
