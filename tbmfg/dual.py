@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from tbmfg.geometry import rotation_z, wrap
+from tbmfg.geometry import FLIP, rotation_z, wrap
 from tbmfg.measure import Samples, nearest
 from tbmfg.rig import Deviation, Laser
 from tbmfg.state import Trajectory
@@ -25,7 +25,6 @@ from tbmfg.timeseries import Floats, seconds
 NORMAL, TROUBLESHOOT, STOP = 0, 1, 2
 LEVELS = ("normal", "troubleshoot", "stop")
 NO_DEVIATION, ABNORMAL = 0, -1  # beside the case numbers 1..32
-FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up from forward-right-down, and back
 SPOT_GAP_S = 2.0  # without a spot for longer nothing is said
 
 # Table 1: signs of the spot (a, b) -> signs of (beta, alpha) -> case of Fig. 8. What is not here is abnormal.

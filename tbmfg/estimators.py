@@ -121,6 +121,27 @@ def _shearer(name: str, summary: str, *needs: str) -> Estimator:
     return Estimator(partial(shearer, name=name), summary, ("imu", *needs), "Yan & Wang (2021)", load)
 
 
+def sbm(problem: Problem, progress: Progress, name: str) -> Result:
+    """One of the three filters of Wang et al. (2019)."""
+    from tbmfg.filters import sbm as filters
+    from tbmfg.outcome import of_samples
+
+    filter_, model = filters.FILTERS[name]
+    run = filter_(problem, switches(problem.rig, name, model))
+    out = of_samples(problem, name, run.x, run.cov, run.used)
+    out.warnings += run.warnings
+    return out
+
+
+def _sbm(name: str, summary: str) -> Estimator:
+    def model() -> type[Node]:
+        from tbmfg.filters.sbm import FILTERS
+
+        return FILTERS[name][1]
+
+    return Estimator(partial(sbm, name=name), summary, ("imu", "magnetometer"), "Wang et al. (2019)", model)
+
+
 ESTIMATORS: dict[str, Estimator] = {
     "batch": Estimator(
         batch,
@@ -159,6 +180,9 @@ ESTIMATORS: dict[str, Estimator] = {
     "shearer-afkf": _shearer(
         "shearer-afkf", "shearer-ckf-ar as a federation of two local filters", "odometer", "magnetometer"
     ),
+    "sbm-cf": _sbm("sbm-cf", "complementary filter: gyro with accelerometer and magnetometer, observers for the rest"),
+    "sbm-ekf": _sbm("sbm-ekf", "extended Kalman filter in Euler angles, with laser spot and barometer"),
+    "sbm-cfekf": _sbm("sbm-cfekf", "the same, its rates corrected by the complementary filter"),
 }
 
 

@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from tbmfg.timeseries import Floats
 
+FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up from forward-right-down, z up from z down, and back
+
 
 def skew(v: Floats) -> Floats:
     """[v]x with [v]x w = v x w; shape (..., 3) -> (..., 3, 3)."""

@@ -68,6 +68,26 @@ def result(
     )
 
 
+def of_samples(problem: Problem, estimator: str, x: Floats, cov: Floats | None, used: dict[str, int]) -> Result:
+    """What a filter returns that takes ``used`` samples of each sensor as they come and gates none.
+
+    ``cov`` None: it has no covariance, and zeros stand in its place, as in ROS messages; no NEES is made of them.
+    """
+    path = trajectory(problem, x, np.zeros((len(x), NAV, NAV)) if cov is None else cov)
+    counts = {name: replace(count, used=used.get(name, count.used)) for name, count in problem.counts.items()}
+    said = (
+        [f"{estimator} has no covariance: zeros stand in its place"] if cov is None else diagnosis.vague_heading(path)
+    )
+    return Result(
+        estimator=estimator,
+        trajectory=path,
+        calibration=dict(problem.calibration),
+        counts=_completed(counts),
+        intervals=list(problem.intervals),
+        warnings=said,
+    )
+
+
 def beyond_gate(problem: Problem, nis: dict[str, Floats]) -> dict[str, np.ndarray]:
     """Which rows lie beyond the gate, by sensor."""
     return {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
@@ -123,6 +143,11 @@ def _counts(problem: Problem, gated: dict[str, np.ndarray]) -> dict[str, Counts]
             count = counts[rows.sensor]
             count.gated = int(rows.samples[gated[rows.sensor]].sum())
             count.used = int(rows.samples.sum()) - count.gated
+    return _completed(counts)
+
+
+def _completed(counts: dict[str, Counts]) -> dict[str, Counts]:
+    """With what is in no other part as unused."""
     return {
         name: replace(count, unused=count.unused + count.received - count.parts()) for name, count in counts.items()
     }

@@ -19,7 +19,7 @@ class Trajectory:
 
     ``t_ns`` (n,) int64; ``position_n`` (n, 3) m; ``quat_xyzw`` (n, 4) of R_nb; ``velocity_n`` (n, 3)
     m/s; ``bias_acc`` (n, 3) m/s^2 and ``bias_gyro`` (n, 3) rad/s in b; ``cov`` (n, 15, 15) in the
-    order and frames of the package docstring.
+    order and frames of the package docstring, all zeros of an estimator that has none.
     """
 
     t_ns: Times
