@@ -130,6 +130,9 @@ def run(
     options: dict[str, Any],
     estimator: Annotated[str, typer.Option(metavar="NAME", help="See `tbmfg estimators`.")] = "batch",
     report: Annotated[bool, typer.Option("--report", help="Write report.html too.")] = False,
+    into: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Copy the log to this .mcap, the poses among its messages.")
+    ] = None,
     force: Force = False,
     debug: Debug = False,
 ) -> None:
@@ -140,7 +143,14 @@ def run(
 
         with _progress_bar("reading") as progress:
             summary = pipeline.run(
-                log, estimator=estimator, output=output, report=report, force=force, progress=progress, **options
+                log,
+                estimator=estimator,
+                output=output,
+                report=report,
+                into=into,
+                force=force,
+                progress=progress,
+                **options,
             )
         _print_summary(summary, output)
 

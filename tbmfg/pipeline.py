@@ -161,12 +161,13 @@ def run(
     estimator: str = "batch",
     output: str | Place | None = None,
     report: bool = False,
+    into: str | Path | None = None,
     force: bool = False,
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files, with
-    ``report`` report.html among them.
+    ``report`` report.html among them, with ``into`` a copy of the log that holds the poses too.
 
     ``options``: ``rig``, a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
     ``truth``: auto, none, a topic or a file. ``outages``: (sensor, start, end) in seconds from the first IMU sample,
@@ -176,6 +177,8 @@ def run(
     known_estimators([estimator])
     if output is not None:
         refuse_existing(output, force)
+    if into is not None:
+        refuse_existing_file(into, force)
     session = open_session(log_path, progress=progress, **options)
     result, summary = session.estimate(estimator, progress)
     if output is not None:
@@ -185,6 +188,10 @@ def run(
             told.add(result, summary, session.truth(result))
             text = told.html()
         write_result(output, result, summary, dump_rig(session.prepared.rig), report=text, force=force)
+    if into is not None:
+        from tbmfg.mcap import write_into
+
+        write_into(log_path, into, result.smoothed or result.trajectory, session.prepared.rig.sensors["imu"].topic)
     return summary
 
 

@@ -78,7 +78,12 @@ def write_result(
         _write_trajectory_files(folder, "trajectory.tum", "result.npz", result.trajectory)
         if result.smoothed is not None:
             _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
-        write_trajectory(folder / "result.mcap", result.trajectory, diagnostics=_diagnostics(result))
+        write_trajectory(
+            folder / "result.mcap",
+            result.trajectory,
+            diagnostics=_diagnostics(result),
+            intervals=result.intervals,
+        )
         (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
         if report is not None:
             (folder / REPORT).write_text(report, "utf-8")

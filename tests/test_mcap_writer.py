@@ -215,7 +215,7 @@ def test_trajectory_as_odometry_and_transforms(tmp_path):
 def test_very_short_trajectories(tmp_path, n):
     write_trajectory(tmp_path / "x.mcap", trajectory(n), diagnostics={"a": "b"})
     with open(tmp_path / "x.mcap", "rb") as file:
-        assert len(list(make_reader(file).iter_messages())) == 3 * n
+        assert len(list(make_reader(file).iter_messages())) == 4 * n
 
 
 def test_pose_covariance_is_that_of_the_errors_about_n():

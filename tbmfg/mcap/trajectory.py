@@ -1,10 +1,10 @@
-"""A trajectory as an MCAP file that Foxglove and evo open: odometry, /tf and diagnostics."""
+"""A trajectory as an MCAP file that Foxglove and evo open: odometry, path, /tf and diagnostics."""
 
 from __future__ import annotations
 
 import heapq
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,12 +12,15 @@ from tbmfg.geometry import log_so3, matrix_from_quat, skew
 from tbmfg.mcap.cdr import CdrWriter
 from tbmfg.mcap.layouts import LAYOUTS, ONE_TRANSFORM
 from tbmfg.mcap.streams import TRANSFORMS
-from tbmfg.mcap.writer import Compression, encoded, write_messages
-from tbmfg.state import POS, ROT, VEL, Trajectory
+from tbmfg.mcap.writer import Compression, Message, encoded, write_messages
+from tbmfg.state import POS, ROT, VEL, Interval, Trajectory
 from tbmfg.timeseries import Floats, seconds
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+PATH = "nav_msgs/msg/Path"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+ODOMETRY_TOPIC, PATH_TOPIC = "/tbmfg/odometry", "/tbmfg/path"
+OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
 
 
 def write_trajectory(
@@ -25,36 +28,60 @@ def write_trajectory(
     trajectory: Trajectory,
     *,
     diagnostics: Mapping[str, str] | None = None,
-    topic: str = "/tbmfg/odometry",
+    intervals: Sequence[Interval] = (),
     frame_id: str = "map",
     child_frame_id: str = "base_link",
     compression: Compression = "zstd",
 ) -> None:
-    """Write nav_msgs/Odometry to ``topic``, the same poses to /tf, and ``diagnostics`` to /diagnostics.
+    """Write nav_msgs/Odometry, all poses as one nav_msgs/Path, the same to /tf, and what happened to /diagnostics.
 
-    ``frame_id`` is n, ``child_frame_id`` is b. Log times are the stamps. Raises LogError where the file
-    cannot be written.
+    ``diagnostics`` come as one status at the start; ``intervals`` as a status of their sensor that warns from the start
+    to the end of each. ``frame_id`` is n, ``child_frame_id`` is b. Log times are the stamps. Raises LogError where the
+    file cannot be written.
     """
+    types, streams = trajectory_messages(trajectory, frame_id, child_frame_id)
     strings = {"frame_id": frame_id, "child_frame_id": child_frame_id}
     pose = {"position": trajectory.position_n, "quat_xyzw": trajectory.quat_xyzw}
+    types["/tf"] = TRANSFORMS
+    streams.append(encoded("/tf", ONE_TRANSFORM, trajectory.t_ns, trajectory.t_ns, pose, strings))
+    if len(trajectory) and (diagnostics or intervals):
+        types["/diagnostics"] = DIAGNOSTICS
+        streams.append(_diagnostics(int(trajectory.t_ns[0]), diagnostics or {}, intervals))
+    write_messages(path, types, heapq.merge(*streams, key=lambda message: message[0]), {}, compression)
+
+
+def trajectory_messages(
+    trajectory: Trajectory, frame_id: str = "map", child_frame_id: str = "base_link", delay_ns: int = 0
+) -> tuple[dict[str, str], list[Iterable[Message]]]:
+    """Types by topic, and the messages of each in order: odometry, and the whole path at its start.
+
+    Log times are the stamps plus ``delay_ns``.
+    """
     twist, twist_cov = body_twist(trajectory)
     odometry = {
-        **pose,
+        "position": trajectory.position_n,
+        "quat_xyzw": trajectory.quat_xyzw,
         "pose_cov": ros_pose_cov(trajectory).reshape(-1, 36),
         "linear": twist[:, :3],
         "angular": twist[:, 3:],
         "twist_cov": twist_cov.reshape(-1, 36),
     }
-    types = {topic: ODOMETRY, "/tf": TRANSFORMS}
-    streams = [
-        encoded(topic, LAYOUTS[ODOMETRY], trajectory.t_ns, trajectory.t_ns, odometry, strings),
-        encoded("/tf", ONE_TRANSFORM, trajectory.t_ns, trajectory.t_ns, pose, strings),
+    strings = {"frame_id": frame_id, "child_frame_id": child_frame_id}
+    t_ns, log_ns = trajectory.t_ns, trajectory.t_ns + delay_ns
+    streams: list[Iterable[Message]] = [
+        encoded(ODOMETRY_TOPIC, LAYOUTS[ODOMETRY], t_ns, log_ns, odometry, strings),
+        [(int(log_ns[0]), PATH_TOPIC, encode_path(trajectory, frame_id))] if len(trajectory) else [],
     ]
-    if diagnostics and len(trajectory):
-        types["/diagnostics"] = DIAGNOSTICS
-        t_ns = int(trajectory.t_ns[0])
-        streams.append(iter([(t_ns, "/diagnostics", encode_diagnostics(t_ns, diagnostics))]))
-    write_messages(path, types, heapq.merge(*streams, key=lambda message: message[0]), {}, compression)
+    return {ODOMETRY_TOPIC: ODOMETRY, PATH_TOPIC: PATH}, streams
+
+
+def encode_path(trajectory: Trajectory, frame_id: str) -> bytes:
+    """A nav_msgs/Path of all keyframes, stamped with the first."""
+    cdr = CdrWriter().header(int(trajectory.t_ns[0]), frame_id).scalars("I", len(trajectory))
+    poses = np.hstack([trajectory.position_n, trajectory.quat_xyzw]).tolist()
+    for t_ns, pose in zip(trajectory.t_ns.tolist(), poses, strict=True):
+        cdr.header(t_ns, frame_id).scalars("d", *pose)
+    return cdr.message()
 
 
 def ros_pose_cov(trajectory: Trajectory) -> Floats:
@@ -94,10 +121,20 @@ def body_twist(trajectory: Trajectory) -> tuple[Floats, Floats]:
     return np.hstack([velocity_b, omega_b]), cov
 
 
-def encode_diagnostics(t_ns: int, values: Mapping[str, str]) -> bytes:
-    """A diagnostic_msgs/DiagnosticArray with one status, named tbmfg, at level OK."""
+def _diagnostics(start_ns: int, values: Mapping[str, str], intervals: Sequence[Interval]) -> Iterator[Message]:
+    """``values`` at the start, then a change of status at either end of every interval."""
+    changes = [(interval.start_ns, WARN, interval.sensor, interval.kind) for interval in intervals]
+    changes += [(interval.end_ns, OK, interval.sensor, f"{interval.kind} over") for interval in intervals]
+    yield start_ns, "/diagnostics", encode_diagnostics(start_ns, OK, "tbmfg", "", values)
+    for t_ns, level, sensor, text in sorted(changes):
+        stamp_ns = max(t_ns, start_ns)  # an outage may begin before the first keyframe
+        yield stamp_ns, "/diagnostics", encode_diagnostics(stamp_ns, level, f"tbmfg: {sensor}", text, {})
+
+
+def encode_diagnostics(t_ns: int, level: int, name: str, message: str, values: Mapping[str, str]) -> bytes:
+    """A diagnostic_msgs/DiagnosticArray with one status."""
     cdr = CdrWriter().header(t_ns, "").scalars("I", 1)
-    cdr.scalars("B", 0).string("tbmfg").string("").string("").scalars("I", len(values))
+    cdr.scalars("B", level).string(name).string(message).string("").scalars("I", len(values))
     for key, value in values.items():
         cdr.string(key).string(value)
     return cdr.message()

@@ -60,6 +60,13 @@ function draw(k) {
     .then(() => setTimeout(draw, 0, k + 1));
 }
 draw(0);
+function width(px) {
+  for (const plot of document.querySelectorAll(".js-plotly-plot")) {
+    Plotly.relayout(plot, {width: px, autosize: px === null});
+  }
+}
+addEventListener("beforeprint", () => width(1000));
+addEventListener("afterprint", () => width(null));
 """
 
 
