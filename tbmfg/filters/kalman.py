@@ -1,6 +1,6 @@
 """Kalman algebra: pure functions (compiled), shared by every filter.
 
-Rows are whitened, so that their noise is one; ``R`` (k, k) replaces it where a filter finds another than the rig's.
+Rows are whitened, so that their noise is one; an ``R`` (k, k) replaces it where a filter finds another than the rig's.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ def predict(P, Phi, Q):
 
 
 @njit(cache=True)
-def innovation(P, H, r, R=None):
-    """Squared normalised innovation r^T S^-1 r and log det S: S = H P H^T + R, R = I unless given."""
-    S = H @ P @ H.T + (np.eye(len(r)) if R is None else R)
+def innovation(P, H, r):
+    """Squared normalised innovation r^T S^-1 r and log det S for whitened rows: S = H P H^T + I."""
+    S = H @ P @ H.T + np.eye(len(r))
     L = np.linalg.cholesky(S)
     y = np.linalg.solve(L, r)
     return y @ y, 2.0 * np.sum(np.log(np.diag(L)))
@@ -43,7 +43,8 @@ def correct(P, H, r, R=None):
     return -(K @ r), 0.5 * (P1 + P1.T)
 
 
-def innovation_noise(residuals, HPHt, floor=1.0):
+@njit(cache=True)
+def innovation_noise(residuals, HPHt, floor):
     """Noise of rows by what their innovations leave after the state's doubt: R = C - H P H^T, (k, k).
 
     C is the mean of e e^T over a window of ``residuals`` (N, k), about no mean; eigenvalues are held at ``floor`` from

@@ -190,7 +190,8 @@ class Measurements:
             R.append(self._noise(rows, r, residual, columns @ P @ columns.T))
             # the whole's covariance is beta P (34): what the rig's noise makes of the innovation
             self.nis[rows.sensor][r] = innovation(beta * P, columns, residual)[0]
-        return correct(P, np.concatenate(H), np.concatenate(residuals), block_diag(*R))
+        noise = R[0] if len(R) == 1 else block_diag(*R)
+        return correct(P, np.concatenate(H), np.concatenate(residuals), noise)
 
     def _linearise(self, rows: Rows, r: int, x: Floats, c: Floats) -> tuple[Floats, Floats]:
         """Whitened residual of one row and its Jacobian to [state, free calibrations]."""
@@ -213,8 +214,8 @@ class Measurements:
         if self.switches.r_adapt == "off" or len(window) < self.switches.window:
             return np.eye(len(residual))
         if self.switches.r_adapt == "printed":
-            R = innovation_noise(np.array(window), np.zeros_like(HPHt), floor=0.0)
+            R = innovation_noise(np.array(window), np.zeros_like(HPHt), 0.0)
         else:
-            R = innovation_noise(np.array(window), HPHt)
+            R = innovation_noise(np.array(window), HPHt, 1.0)
         self.noise[rows.sensor][r] = np.sqrt(np.trace(R) / len(R))
         return R

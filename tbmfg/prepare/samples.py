@@ -12,6 +12,7 @@ from tbmfg.inertial.steps import Steps, make_steps
 from tbmfg.mcap.clouds import TYPE as CLOUDS
 from tbmfg.mcap.info import guess_role
 from tbmfg.measure import Samples
+from tbmfg.prepare import health
 from tbmfg.rig import PositionSensor, Prism, Rig, Sensor, kind_of
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats, Log, Series, seconds
@@ -130,7 +131,11 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
             values = np.ascontiguousarray(VALUES[kind](series))
         except KeyError:
             raise LogError(f"{log.path}: {name}: {sensor.topic} is {series.type}, {instead(log, kind)}") from None
-        samples[name] = Samples(name, t, values, sigma_of(sensor, series)).select(keep)
+        found = Samples(name, t, values, sigma_of(sensor, series)).select(keep)
+        sound, said = health.check(sensor, found)
+        warnings += [f"{name}: {line}" for line in said]
+        if sound.sum() >= 2:
+            samples[name] = found.select(sound)
     return samples, counts
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tbmfg import earth
-from tbmfg.geometry import rotation_from_rpy, rotation_z, yaw_of
+from tbmfg.geometry import rotation_from_rpy, rotation_z, wrap, yaw_of
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps, compensate
 from tbmfg.measure import GyroFrame, Samples, gyro_frame
@@ -19,6 +19,7 @@ from tbmfg.timeseries import Floats
 
 COURSE_S = 120.0  # of driving that a heading is taken from
 COURSE_SD = np.deg2rad(5.0)  # a way that leaves a larger doubt than this is no course
+CONTRADICTION = 4.0  # sds between a given heading and the magnetic one from which it is said
 GYROCOMPASS = np.deg2rad(15.0)  # a gyro whose bias leaves a larger doubt than this cannot find north
 
 
@@ -64,8 +65,9 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
     R_start, yaw_sd, gyrocompassed = R_level, start.yaw_sd, False
     if start.yaw is not None:
         R_start = rotation_z(start.yaw - float(yaw_of(R_level))) @ R_level
-    elif (found := _magnetic_heading(rig, samples, frame, R_level)) is not None:
-        R_start, yaw_sd = rotation_z(found) @ R_level, min(yaw_sd, np.deg2rad(10.0))
+        warnings += _against_magnetometer(rig, samples, frame, R_start)
+    elif (magnetic := _magnetic_heading(rig, samples, frame, R_level)) is not None:
+        R_start, yaw_sd = rotation_z(magnetic[0]) @ R_level, min(yaw_sd, np.deg2rad(10.0))
     elif still and bound < GYROCOMPASS:
         turn = alignment.gyrocompass(steps, R_0t, still, R_level, rig.origin.rate_n)
         R_start, yaw_sd, gyrocompassed = rotation_z(turn) @ R_level, bound, True
@@ -110,8 +112,11 @@ def _with_given_tilt(R_level: Floats, roll: float | None, pitch: float | None) -
     return rotation_from_rpy(given)
 
 
-def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_level: Floats) -> float | None:
-    """Turn about the vertical from the levelled start frame to n by the first ten seconds of magnetometer, or None."""
+def _magnetic_heading(
+    rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_level: Floats
+) -> tuple[float, str, float] | None:
+    """Turn about the vertical from the levelled start frame to n by the first ten seconds of magnetometer, the sensor's
+    name and the tangent of the dip; None without one."""
     for name, s in samples.items():
         sensor = rig.sensors[name]
         if isinstance(sensor, Magnetometer):
@@ -119,8 +124,30 @@ def _magnetic_heading(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R
             b = (s.values[rows] - sensor.hard_iron) @ sensor.R_bm.T
             h = np.einsum("nij,nj->ni", frame.at(s.t_s[rows] - sensor.clock_offset), b).mean(axis=0) @ R_level.T
             north = earth.north_direction(rig.origin.x_axis_azimuth) - sensor.declination
-            return float(north - np.arctan2(h[1], h[0]))
+            return float(north - np.arctan2(h[1], h[0])), name, float(-h[2] / np.hypot(h[0], h[1]))
     return None
+
+
+def _against_magnetometer(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_start: Floats) -> list[str]:
+    """Say where a given heading and the magnetometer contradict each other, and whether turning round the sign of the
+    declination would reconcile them. A tilt error turns the magnetic heading by up to tan(dip) times itself (H9)."""
+    magnetic = _magnetic_heading(rig, samples, frame, R_start)
+    if magnetic is None:
+        return []
+    turn, name, tan_dip = magnetic
+    sensor, start = rig.sensors[name], rig.initial
+    sd = np.linalg.norm([start.yaw_sd, sensor.sigma, sensor.declination_sd, tan_dip * start.tilt_sd])
+    turn, turned = wrap(np.array([turn, turn + 2.0 * sensor.declination]))
+    if abs(turn) < CONTRADICTION * sd:
+        return []
+    reason = "check declination, mounting and hard iron, and what steel is near"
+    if abs(turned) < 0.5 * abs(turn):
+        reason = (
+            f"with declination_deg={-sensor.declination_deg:g} it would be {np.rad2deg(abs(turned)):.1f} deg: east is "
+            "positive"
+        )
+    apart = f"{np.rad2deg(abs(turn)):.1f} deg from initial.yaw_deg, {abs(turn) / sd:.0f} sd"
+    return [f"{name}: its heading over the first 10 s is {apart}; {reason}"]
 
 
 def _course_heading(

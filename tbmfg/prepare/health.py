@@ -1,0 +1,96 @@
+"""What odometers and magnetometers say against their own health: before estimating, and so for every estimator alike.
+
+Each check returns which samples are sound, (n,) bool, and a line for every fault that it has found.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from tbmfg.fields import MICRO_TESLA, STANDARD_GRAVITY
+from tbmfg.measure import Samples
+from tbmfg.rig import Magnetometer, Odometer, Sensor
+from tbmfg.timeseries import Floats
+
+FASTEST = 5 * STANDARD_GRAVITY  # m/s^2: no machine's speed changes faster; an encoder's that rolls over does
+NOISE = 10.0  # sds of an odometer's noise that are no jump either
+STUCK = 10  # readings in a row that are equal to the last digit
+PILE = 3  # times as many readings at the end of the scale as at the next value inside: noise thins out, limits do not
+LEVELS = 10  # different readings from which an axis shows how noise thins out
+
+Sound = tuple[NDArray[np.bool_], list[str]]
+
+
+def check(sensor: Sensor, samples: Samples) -> Sound:
+    """The check of this kind of sensor; sensors without one are sound."""
+    if isinstance(sensor, Odometer):
+        return odometer(samples.t_s, samples.values, sensor.sigma)
+    if isinstance(sensor, Magnetometer):
+        return magnetometer(samples.t_s, samples.values)
+    return np.ones(len(samples.t_s), dtype=bool), []
+
+
+def odometer(t_s: Floats, speed: Floats, sigma: float) -> Sound:
+    """Leaves out speeds (n,) far from the median of the five about them: an encoder's roll-over, a broken message.
+
+    None where most are so: then the unit is wrong, or the clock.
+    """
+    if len(speed) < 5:
+        return np.ones(len(speed), dtype=bool), []
+    around = np.median(sliding_window_view(np.pad(speed, 2, mode="reflect"), 5), axis=1)
+    period = np.median(np.diff(t_s))
+    wrong = np.abs(speed - around) > 2 * period * FASTEST + NOISE * sigma
+    if not wrong.any() or 2 * wrong.sum() >= len(wrong):
+        return np.ones(len(speed), dtype=bool), []
+    worst = np.argmax(np.abs(speed - around))
+    return ~wrong, [
+        f"{wrong.sum()} of {len(speed)} speeds jump as no machine can, at {t_s[worst]:.1f} s from {around[worst]:.3g} "
+        f"to {speed[worst]:.4g} m/s and back (an encoder that rolls over?); left out"
+    ]
+
+
+def magnetometer(t_s: Floats, field: Floats) -> Sound:
+    """Leaves out fields (n, 3) that repeat to the last digit, but the first, and those at the end of an axis's scale.
+
+    A reading with noise does not repeat. An axis that never changes while the others do is said and kept.
+    """
+    sound, said = np.ones(len(field), dtype=bool), []
+    same = np.concatenate([[False], (np.diff(field, axis=0) == 0).all(axis=1)])
+    hung = np.zeros(len(field), dtype=bool)
+    longest = (0, 0)
+    for first, last in _runs(same):
+        if last - first >= STUCK - 1:
+            hung[first:last] = True
+            longest = max(longest, (first, last), key=lambda run: run[1] - run[0])
+    if hung.any():
+        sound &= ~hung
+        said.append(
+            f"hangs on one reading: {hung.sum()} of {len(field)} samples repeat the one before, the longest time from "
+            f"{t_s[longest[0] - 1]:.1f} to {t_s[longest[1] - 1]:.1f} s; left out"
+        )
+    for axis, name in enumerate("xyz"):
+        values, counts = np.unique(field[~hung, axis], return_counts=True)
+        if len(values) == 1 and len(field) > STUCK and not hung.any():
+            said.append(
+                f"its {name} axis reads {values[0] / MICRO_TESLA:.4g} uT in all {len(field)} samples: dead or at the "
+                "end of its scale; unless the field has no such part, leave the sensor out"
+            )
+        for end, inner in ((0, 1), (-1, -2)):
+            if len(values) < LEVELS or counts[end] < STUCK or counts[end] < PILE * counts[inner]:
+                continue
+            limit = (field[:, axis] == values[end]) & ~hung
+            if max(last - first for first, last in _runs(limit)) >= STUCK:
+                sound &= ~limit
+                said.append(
+                    f"its {name} axis is at the end of its scale, {values[end] / MICRO_TESLA:.4g} uT, in {limit.sum()} "
+                    f"of {len(field)} samples, the first at {t_s[np.argmax(limit)]:.1f} s; left out"
+                )
+    return sound, said
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First index and the one after the last of each stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
