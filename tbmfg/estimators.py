@@ -13,7 +13,7 @@ from tbmfg.rig import Rig, kind_of, switches
 
 if TYPE_CHECKING:
     from tbmfg.problem import Problem
-    from tbmfg.smoother.incremental import Online
+    from tbmfg.smoother.online import Online
     from tbmfg.state import Result
     from tbmfg.timeseries import Floats
 
@@ -67,15 +67,15 @@ def isam2(problem: Problem, progress: Progress) -> Result:
     from tbmfg.smoother import batch as smoother
     from tbmfg.smoother import incremental
 
-    online = incremental.run(problem, None, progress)
+    online = incremental.run(problem, progress)
     return _online(problem, "isam2", online, smoother.at(problem, online.last_x, online.c).cov)
 
 
 def fixed_lag(problem: Problem, progress: Progress) -> Result:
-    """iSAM2 over the rig's lag: causal estimates, and the last one of every keyframe before it left."""
-    from tbmfg.smoother import incremental
+    """Smoother over the rig's lag: causal estimates, and the last one of every keyframe before it left."""
+    from tbmfg.smoother import window
 
-    online = incremental.run(problem, problem.rig.lag_s, progress)
+    online = window.run(problem, problem.rig.lag_s, progress)
     return _online(problem, "fixed-lag", online, online.last_cov)
 
 
@@ -151,9 +151,9 @@ ESTIMATORS: dict[str, Estimator] = {
     ),
     "fixed-lag": Estimator(
         fixed_lag,
-        "smooths online over the rig's lag_s seconds: GTSAM's incremental fixed-lag smoother",
+        "smooths online over the rig's lag_s seconds: the rows of batch in a moving window",
         ("imu",),
-        "Kaess et al. (2012); Dong-Si & Mourikis (2011)",
+        "Dong-Si & Mourikis (2011)",
     ),
     "isam2": Estimator(
         isam2,

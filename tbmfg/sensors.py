@@ -255,6 +255,12 @@ class Rows:
     def dof(self) -> int:
         return self.sigma.shape[1]
 
+    def between(self, first: int, last: int) -> Rows:
+        """The rows on the keyframes ``first`` to ``last`` alone, counted from ``first``."""
+        own = slice(np.searchsorted(self.i, first), np.searchsorted(self.j, last, side="right"))
+        parts = (self.z[own], self.data[own], self.sigma[own], self.calib, self.samples[own], self.loss)
+        return Rows(self.sensor, self.model, self.i[own] - first, self.j[own] - first, *parts)
+
     def evaluate(self, x: Floats, c: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Whitened residuals and Jacobians at the keyframe states ``x`` (N, 21 + e) and calibrations ``c``."""
         return self.evaluate_at(x[self.i], x[self.j], c)

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from tbmfg.estimators import estimate
 from tbmfg.filters import ins
 from tbmfg.prepare import prepare
-from tbmfg.smoother import batch, incremental
+from tbmfg.smoother import batch, incremental, window
 from tbmfg.smoother.factors import Factors, Step, pose_chart
 from tests import problems
 
@@ -37,7 +37,7 @@ def fine(monkeypatch):
 
 
 def test_isam2_ends_where_batch_does(problem, smoothed):
-    online = incremental.run(problem, None)
+    online = incremental.run(problem)
     assert online.reanchored == []
     # 5 % of an sd: what iSAM2 leaves where it is until it moves by RELINEARIZE
     sd = np.sqrt(np.einsum("kii->ki", smoothed.cov))
@@ -49,19 +49,19 @@ def test_isam2_ends_where_batch_does(problem, smoothed):
 
 def test_newest_estimate_is_that_of_the_whole_past(problem, smoothed):
     # the last keyframe has no future: causal and smoothed agree there, covariance included
-    online = incremental.run(problem, None)
+    online = incremental.run(problem)
     assert_allclose(online.causal_x[-1], online.last_x[-1], atol=1e-4)
     assert_allclose(np.diag(online.causal_cov[-1]), np.diag(smoothed.cov[-1]), rtol=0.05)
 
 
 def test_window_longer_than_the_log_is_isam2(problem):
-    window, whole = incremental.run(problem, 1000.0), incremental.run(problem, None)
-    assert_allclose(window.causal_x, whole.causal_x, atol=1e-3)
+    moving, whole = window.run(problem, 1000.0), incremental.run(problem)
+    assert_allclose(moving.causal_x, whole.causal_x, atol=1e-3)
 
 
 def test_last_estimate_of_the_window_beats_the_causal_one(problem):
     simulation = problems.drive(seed=4, duration=20.0)
-    online, true = incremental.run(problem, 5.0), problems.true_states(simulation, problem)
+    online, true = window.run(problem, 5.0), problems.true_states(simulation, problem)
     causal, last = (
         np.sqrt(np.mean(problems.state_errors(x, true)[:, 2] ** 2)) for x in (online.causal_x, online.last_x)
     )
@@ -75,17 +75,34 @@ def test_counts_add_up_and_both_trajectories_come(problem):
     assert all(count.parts() == count.received for count in result.counts.values())
 
 
-def test_failed_solver_starts_again_and_says_so(problem, monkeypatch):
-    update, calls = incremental._Window.update, []
+def test_failed_window_starts_again_and_says_so(problem, monkeypatch):
+    solve, calls = window._Window.solve, []
 
-    def fail_once(self, step, t, keys):
-        calls.append(t)
+    def fail_once(self):
+        calls.append(self.first)
+        if len(calls) == 30:
+            raise ArithmeticError("3 unknowns of the window are not determined")
+        solve(self)
+
+    monkeypatch.setattr(window._Window, "solve", fail_once)
+    result = estimate("fixed-lag", problem)
+    assert np.isfinite(result.trajectory.position_n).all()
+    [line] = [w for w in result.warnings if "started again" in w]
+    assert "not determined" in line
+    assert f"{problem.keyframes_s[29]:.1f} s" in line
+
+
+def test_failed_isam2_starts_again_and_says_so(problem, monkeypatch):
+    record, calls = incremental._record, []
+
+    def fail_once(isam, factors, k, out, e):
+        calls.append(k)
         if len(calls) == 30:
             raise RuntimeError("Indeterminate linear system (Symbol: x29)")
-        update(self, step, t, keys)
+        record(isam, factors, k, out, e)
 
-    monkeypatch.setattr(incremental._Window, "update", fail_once)
-    result = estimate("fixed-lag", problem)
+    monkeypatch.setattr(incremental, "_record", fail_once)
+    result = estimate("isam2", problem)
     assert np.isfinite(result.trajectory.position_n).all()
     [line] = [w for w in result.warnings if "started again" in w]
     assert "Indeterminate" in line
@@ -95,7 +112,7 @@ def test_failed_solver_starts_again_and_says_so(problem, monkeypatch):
 def test_custom_factors_have_the_jacobians_of_their_residuals(problem):
     x = ins.run(problem).x
     factors = Factors(problem)
-    values, step = gtsam.Values(), Step(gtsam.NonlinearFactorGraph(), gtsam.Values(), [])
+    values, step = gtsam.Values(), Step(gtsam.NonlinearFactorGraph(), gtsam.Values())
     k = len(x) // 2
     for q in (k - 1, k):
         values.insert(X(q), gtsam.Pose3(gtsam.Rot3(x[q, :9].reshape(3, 3)), x[q, 9:12]))

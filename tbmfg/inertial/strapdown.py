@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from tbmfg.geometry import log_so3
+
 R_, P_, V_, BA_, BG_ = slice(0, 9), slice(9, 12), slice(12, 15), slice(15, 18), slice(18, 21)
 STATE = 21
 
@@ -178,3 +180,9 @@ def correct_states(x: np.ndarray, d: np.ndarray) -> np.ndarray:
     for k in range(len(x)):
         out[k] = correct_state(x[k], d[k])
     return out
+
+
+def difference(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
+    """x (-) x0, the inverse of ``correct_states``: (n, 21 + e) each -> (n, 15 + e)."""
+    R, R0 = x[:, :9].reshape(-1, 3, 3), x0[:, :9].reshape(-1, 3, 3)
+    return np.hstack([log_so3(np.swapaxes(R0, 1, 2) @ R), x[:, 9:] - x0[:, 9:]])

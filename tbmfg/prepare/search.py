@@ -12,6 +12,7 @@ from tbmfg.inertial.noise import spectral_floor
 from tbmfg.prepare.build import build
 from tbmfg.prepare.start import Setup
 from tbmfg.problem import Problem
+from tbmfg.smoother import batch
 from tbmfg.state import Calibrated
 from tbmfg.timeseries import Floats
 
@@ -44,6 +45,8 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
             scale, sd = _noise_scale(setup, offsets, split, scale)
         tell("prepare", 0.5 + 0.25 * turn)
     factors = np.maximum(scale * split, 1.0) if auto else scale * split
+    if unknown:
+        offset_sd = _smooth_offsets(setup, offsets, factors, unknown)
     problem = build(setup, offsets, factors)
     named = {"noise_factor_gyro": factors[0], "noise_factor_acc": factors[1], "noise_factor": np.sqrt(np.prod(factors))}
     for key, value in named.items():
@@ -80,6 +83,21 @@ def _settle_offsets(setup: Setup, offsets: dict[str, float], factors: Floats, un
             if line not in setup.warnings:
                 setup.warnings.append(line)
     return {name: float(np.sqrt(filtered.c_cov[k, k])) for name, k in where.items()}
+
+
+def _smooth_offsets(setup: Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> dict[str, float]:
+    """Move the keyframes to the offsets that the smoother finds, in place; their sds in s.
+
+    A filter linearises once, and its offset errs by what its first states erred. Online solvers hold the offset: only
+    at the smoother's do they end where ``batch`` does.
+    """
+    problem = build(setup, offsets, factors, SEARCH_S)
+    filtered = ins.run(problem)
+    smoothed = batch.solve(problem, filtered.x, filtered.c)
+    where = {name: problem.parameters.names.index(f"{name}.clock_offset") for name in unknown}
+    for name, k in where.items():
+        offsets[name] += float(smoothed.c[k])
+    return {name: float(np.sqrt(smoothed.c_cov[k, k])) for name, k in where.items()}
 
 
 def _coarse_offset(setup: Setup, name: str) -> float:

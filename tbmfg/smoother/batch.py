@@ -89,9 +89,11 @@ def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tup
 def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block], dict[str, Floats], float]:
     """All whitened rows at ``states``, squared normalised residuals by sensor, and the cost."""
     m, e = len(free), len(problem.drift_walk)
-    blocks = [graph.imu_block(imu[0], states.x, imu[1], m), *graph.prior_blocks(problem, states, free)]
+    prior = graph.prior_rows(problem.parameters, problem.prior.cov, free)
+    mean = States(problem.prior.x[None], problem.parameters.mean)
+    blocks = [graph.imu_block(imu[0], states.x, imu[1], m), graph.about(prior, mean, states, free)]
     if e:
-        blocks.append(graph.drift_block(problem, states, m))
+        blocks.append(graph.drift_block(problem, np.diff(problem.keyframes_s), states, m))
     cost = 0.5 * sum(float(np.sum(block.b**2)) for block in blocks)
     nis = {}
     for rows in problem.rows:

@@ -212,6 +212,20 @@ def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
     return Elimination(conditionals, border, *lengths(blocks, n, d, m), n, d, m)
 
 
+def marginal(blocks: list[Block], d: int, m: int) -> Block:
+    """What keyframe 0 of two leaves on keyframe 1 and the constants, as rows on the latter (its keyframe 0), from all
+    rows on keyframe 0; those on keyframe 1 alone are left where they are."""
+    on_first = [blk for blk in blocks if blk.A_j is not None] + [
+        Block(blk.i[own], blk.A_i[own], None, blk.A_c[own], blk.b[own])
+        for blk in blocks
+        if blk.A_j is None and (own := blk.i == 0).any()
+    ]
+    conditionals, border = _eliminate(*assemble(on_first, 2, d, m), 2, d, m)
+    rows = np.zeros((d + m, d + m + 1))
+    rows[:d, :d], rows[:d, d:], rows[d:, d:] = conditionals[1, :, :d], conditionals[1, :, 2 * d :], border
+    return Block(np.zeros(1, dtype=int), rows[None, :, :d], None, rows[None, :, d:-1], rows[None, :, -1])
+
+
 def lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:
     """Length of every column, keyframes (n, d) and constants (m,)."""
     squares, border = np.zeros((n, d)), np.zeros(m)

@@ -28,11 +28,10 @@ BLOCKS = {"X": slice(0, 6), "V": VEL, "B": BIAS, "D": slice(NAV, None)}
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one keyframe adds: factors, first guesses of the new variables, and keys that are not of a keyframe."""
+    """What one keyframe adds: factors, and first guesses of the new variables."""
 
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
-    constants: list[int]
 
 
 class Factors:
@@ -78,7 +77,7 @@ class Factors:
             drift = noiseModel.Gaussian.Covariance(cov[NAV:, NAV:])
             graph.add(gtsam.PriorFactorVector(D(k), x[21:], drift))
         self.known.clear()
-        return Step(graph, values, [])
+        return Step(graph, values)
 
     def motion(self, k: int, x_before: Floats, step: Step) -> None:
         """Add the IMU factor from keyframe k - 1, preintegrated at the biases of ``x_before``, and its guess of k."""
@@ -107,8 +106,7 @@ class Factors:
                     self._constant(sensor, key, step)
 
     def _constant(self, sensor: int, key: int, step: Step) -> None:
-        """A calibration with its prior, when it first appears; its key in any case, to be kept in a window."""
-        step.constants.append(key)
+        """A calibration with its prior, when it first appears."""
         if key in self.known:
             return
         self.known.add(key)

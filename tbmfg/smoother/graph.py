@@ -9,7 +9,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.stats import chi2
 
-from tbmfg.problem import Problem
+from tbmfg.inertial.strapdown import difference
+from tbmfg.problem import Parameters, Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother.chain import Block
 from tbmfg.state import NAV, POS
@@ -117,10 +118,10 @@ def sensor_block(rows: Rows, states: States, free: np.ndarray) -> tuple[Block, F
     return Block(rows.i, Ji * scaled, Jj * scaled if binary else None, A_c[:, :, free] * scaled, -r * root), nis
 
 
-def drift_block(problem: Problem, states: States, m: int) -> Block:
-    """Random walk of the drifting calibrations between neighbours."""
+def drift_block(problem: Problem, elapsed_s: Floats, states: States, m: int) -> Block:
+    """Random walk of the drifting calibrations between neighbours, ``elapsed_s`` (n - 1,) apart."""
     n, d, e = len(states.x) - 1, problem.size, len(problem.drift_walk)
-    sigma = np.maximum(problem.drift_walk * np.sqrt(np.diff(problem.keyframes_s))[:, None], 1e-9)
+    sigma = np.maximum(problem.drift_walk * np.sqrt(elapsed_s)[:, None], 1e-9)
     A_i, A_j = np.zeros((n, e, d)), np.zeros((n, e, d))
     which = np.arange(e)
     A_i[:, which, NAV + which], A_j[:, which, NAV + which] = -1.0 / sigma, 1.0 / sigma
@@ -128,20 +129,19 @@ def drift_block(problem: Problem, states: States, m: int) -> Block:
     return Block(np.arange(n), A_i, A_j, np.zeros((n, e, m)), b)
 
 
-def prior_blocks(problem: Problem, states: States, free: np.ndarray) -> list[Block]:
-    """Prior of the first state and of the free calibrations, whitened."""
-    from tbmfg.geometry import log_so3
+def prior_rows(parameters: Parameters, cov: Floats, free: np.ndarray) -> Block:
+    """Prior with covariance ``cov`` of a first state's error, and of the free calibrations, about their means."""
+    d, m = len(cov), len(free)
+    A, A_c = np.zeros((1, d + m, d)), np.zeros((1, d + m, m))
+    A[0, :d] = np.linalg.inv(np.linalg.cholesky(cov))
+    A_c[0, d:] = np.diag(1.0 / parameters.sd[free])
+    return Block(np.zeros(1, dtype=int), A, None, A_c, np.zeros((1, d + m)))
 
-    d, m = problem.size, len(free)
-    x, x0 = states.x[0], problem.prior.x
-    error = np.concatenate([log_so3(x0[:9].reshape(3, 3).T @ x[:9].reshape(3, 3)), x[9:] - x0[9:]])
-    whiten = np.linalg.inv(np.linalg.cholesky(problem.prior.cov))
-    first = np.zeros(1, dtype=int)
-    state = Block(first, whiten[None], None, np.zeros((1, d, m)), -(whiten @ error)[None])
-    sd = problem.parameters.sd[free]
-    deviation = (states.c[free] - problem.parameters.mean[free]) / sd
-    constants = Block(first, np.zeros((1, m, d)), None, np.diag(1.0 / sd)[None], -deviation[None])
-    return [state, constants]
+
+def about(rows: Block, at: States, states: States, free: np.ndarray) -> Block:
+    """Linear rows on keyframe 0 that were made about ``at``, about the first of ``states``."""
+    move, change = difference(states.x[:1], at.x[:1])[0], (states.c - at.c)[free]
+    return Block(rows.i, rows.A_i, None, rows.A_c, rows.b - rows.A_i @ move - rows.A_c @ change)
 
 
 def threshold(dof: int) -> float:

@@ -1,0 +1,162 @@
+"""Smoothing online over the last seconds: Gauss-Newton on a window of keyframes at every new one.
+
+The window is a short chain of the batch smoother's own rows. What the QR elimination of its oldest keyframe carries
+on is what that keyframe leaves when its time is up: linear rows on its neighbour and the constants (Dong-Si & Mourikis
+2011, in square-root form). Constants stay. IMU factors are linearised anew where their states have moved; all other
+rows, with the weights of their losses, at every update. Clock offsets are those found by ``prepare``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from tbmfg.errors import EstimationError
+from tbmfg.inertial.strapdown import correct_states, difference
+from tbmfg.problem import Problem
+from tbmfg.smoother import graph
+from tbmfg.smoother.chain import Block, eliminate, marginal
+from tbmfg.smoother.graph import States
+from tbmfg.smoother.online import REANCHOR_INFLATION, Online
+from tbmfg.timeseries import Floats
+
+# Change of rotation [rad] and of velocity [m/s] from which an IMU factor is linearised anew: its terms of second
+# order, rotation times velocity, are below 0.1 mm/s then.
+MOVED_ROT, MOVED_VEL = 3e-3, 3e-2
+MOST_ITERATIONS = 4
+
+
+class _Window:
+    """Keyframes ``first`` .. ``first + len(x) - 1`` of a problem, and the rows that those before them have left."""
+
+    def __init__(self, problem: Problem, free: np.ndarray, first: int, x: Floats, cov: Floats) -> None:
+        """Start at keyframe ``first`` with state ``x`` (21 + e,), covariance ``cov``, and the rig's calibrations."""
+        d = problem.size
+        self.problem, self.free, self.first = problem, free, first
+        self.x, self.c = x[None].copy(), problem.parameters.start.copy()
+        self.left = graph.prior_rows(problem.parameters, cov, free)
+        self.left_at = States(self.x.copy(), problem.parameters.mean.copy())
+        self.factors: list[gtsam.NonlinearFactorGraph] = []
+        self.imu_at = np.zeros((0, 2, len(x)))  # where the IMU factors are linearised
+        self.imu = Block(
+            np.zeros(0, dtype=int), *np.zeros((2, 0, 15, d)), np.zeros((0, 15, len(free))), np.zeros((0, 15))
+        )
+        self.times, self.zero = problem.keyframes_s, graph.no_bias(2)
+
+    def extend(self) -> None:
+        """Add the next keyframe, where the IMU says that it is."""
+        x, k = self.x[-1], self.first + len(self.x)
+        pim = graph.preintegrate(self.problem, k - 1, x)
+        before = gtsam.NavState(gtsam.Rot3(x[:9].reshape(3, 3)), x[9:12], x[12:15])
+        after = pim.predict(before, gtsam.imuBias.ConstantBias(x[15:18], x[18:21]))
+        x = np.concatenate([after.attitude().matrix().ravel(), after.position(), after.velocity(), x[15:]])
+        self.x = np.vstack([self.x, x])
+        factor = gtsam.NonlinearFactorGraph()
+        factor.add(gtsam.CombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), pim))
+        self.factors.append(factor)
+        self.imu_at = np.concatenate([self.imu_at, self.x[None, -2:]])
+        new, old = graph.imu_block(factor, self.x[-2:], self.zero, len(self.free)), self.imu
+        pairs = ((old.A_i, new.A_i), (old.A_j, new.A_j), (old.A_c, new.A_c), (old.b, new.b))
+        self.imu = Block(np.arange(len(self.factors)), *(np.concatenate(pair) for pair in pairs))
+
+    def solve(self) -> None:
+        """Gauss-Newton until neither a loss nor an IMU factor asks for more. Raises ArithmeticError where an unknown is
+        not determined."""
+        newest = len(self.x) - 1
+        for _ in range(MOST_ITERATIONS):
+            blocks, doubted = self._blocks(newest)
+            chain = eliminate(blocks, newest + 1, self.problem.size, len(self.free))
+            if missing := chain.undetermined():
+                raise ArithmeticError(f"{len(missing)} unknowns of the window are not determined")
+            dx, dc = chain.solve()
+            self.x = correct_states(self.x, dx)
+            self.c[self.free] += dc
+            if not np.isfinite(self.x).all():
+                raise ArithmeticError(f"the state at keyframe {self.first + newest} is not finite")
+            if not self._relinearise() and not doubted:
+                break
+        self.cov, self.c_cov = chain.covariances()
+
+    def record(self, n: int, out: Online) -> None:
+        """Keep the window's keyframe n as it was solved last, with the residuals of its rows."""
+        k = self.first + n
+        out.last_x[k], out.last_cov[k] = self.x[n], self.cov[n]
+        out.residuals(self.problem, k, self.c)
+
+    def drop(self) -> None:
+        """Let the oldest keyframe leave."""
+        self.left = marginal(self._blocks(1)[0], self.problem.size, len(self.free))
+        self.left_at = States(self.x[1:2].copy(), self.c.copy())
+        self.x, self.cov, self.first = self.x[1:], self.cov[1:], self.first + 1
+        self.factors.pop(0)
+        self.imu_at, imu = self.imu_at[1:], self.imu
+        self.imu = Block(imu.i[:-1], imu.A_i[1:], imu.A_j[1:], imu.A_c[1:], imu.b[1:])
+
+    def _relinearise(self) -> bool:
+        """Linearise the IMU factors whose states have moved; whether there were any."""
+        if not self.factors:
+            return False
+        change = np.abs(np.stack([self.x[:-1], self.x[1:]], axis=1) - self.imu_at)
+        moved = (change[:, :, :9].max(axis=(1, 2)) > MOVED_ROT) | (change[:, :, 12:15].max(axis=(1, 2)) > MOVED_VEL)
+        for n in np.flatnonzero(moved):
+            self.imu_at[n] = self.x[n : n + 2]
+            block = graph.imu_block(self.factors[n], self.imu_at[n], self.zero, len(self.free))
+            self.imu.A_i[n], self.imu.A_j[n], self.imu.b[n] = block.A_i[0], block.A_j[0], block.b[0]
+        return bool(moved.any())
+
+    def _blocks(self, last: int) -> tuple[list[Block], bool]:
+        """All rows on the window's keyframes 0 .. ``last`` about their present states, and whether a loss takes weight
+        from a row of the last one: such a weight follows the state, and has to be found by iterating."""
+        m, states = len(self.free), States(self.x[: last + 1], self.c)
+        blocks = [graph.about(self.left, self.left_at, states, self.free)]
+        if last:
+            imu, at = self.imu, self.imu_at[:last]
+            b = imu.b[:last] - np.einsum("kij,kj->ki", imu.A_i[:last], difference(states.x[:-1], at[:, 0]))
+            b -= np.einsum("kij,kj->ki", imu.A_j[:last], difference(states.x[1:], at[:, 1]))
+            blocks.append(Block(imu.i[:last], imu.A_i[:last], imu.A_j[:last], imu.A_c[:last], b))
+            if len(self.problem.drift_walk):
+                elapsed = np.diff(self.times[self.first : self.first + last + 1])
+                blocks.append(graph.drift_block(self.problem, elapsed, states, m))
+        doubted = False
+        for every in self.problem.rows:
+            rows = every.between(self.first, self.first + last)
+            if len(rows):
+                block, nis = graph.sensor_block(rows, states, self.free)
+                blocks.append(block)
+                doubted |= rows.loss != "none" and bool(np.any(nis[rows.j == last] > graph.threshold(rows.dof) ** 2))
+        return blocks, doubted
+
+
+def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None = None) -> Online:
+    """Smooth online over ``lag_s`` seconds. Raises EstimationError where the start is not determined."""
+    times, names = problem.keyframes_s, problem.parameters.names
+    free = np.array([k for k in problem.parameters.free if not names[k].endswith("clock_offset")], dtype=int)
+    out = Online.empty(problem)
+    window = _Window(problem, free, 0, problem.prior.x, problem.prior.filter_cov)
+    for k in range(len(times)):
+        if k > 0:
+            window.extend()
+            while window.first < k and times[window.first] < times[k] - lag_s:
+                window.record(0, out)
+                window.drop()
+        guess = window.x[-1]
+        try:
+            window.solve()
+        except (ArithmeticError, np.linalg.LinAlgError) as error:
+            if k == 0:
+                raise EstimationError(f"not determined at the start: {error}; give priors in the rig") from error
+            for n in range(k - window.first):
+                window.record(n, out)
+            window = _Window(problem, free, k, guess, out.causal_cov[k - 1] * REANCHOR_INFLATION)
+            window.solve()
+            out.reanchored.append((k, str(error)))
+        out.causal_x[k], out.causal_cov[k] = window.x[-1], window.cov[-1]
+        if progress is not None and k % 50 == 0:
+            progress(k / len(times))
+    for n in range(len(window.x)):
+        window.record(n, out)
+    out.c, out.c_cov[np.ix_(free, free)] = window.c, window.c_cov
+    return out
