@@ -152,24 +152,24 @@ def _back(conditionals, border, n, d, m):
 
 
 @njit(cache=True)
-def _covariances(conditionals, border, n, d, m):
-    """Covariance of every x_k (n, d, d) and of c (m, m).
+def _covariances(conditionals, border, first, n, d, m):
+    """Covariance of every x_k from ``first`` on, (n - first, d, d), and of c (m, m).
 
     With x_k = R^-1 (y - S [x_next; c]) and J = cov [x_next; c]: cov x_k = R^-1 R^-T + G J G^T and
     cov(x_k, [x_next; c]) = -G J, G = R^-1 S.
     """
-    out = np.zeros((n, d, d))
+    out = np.zeros((n - first, d, d))
     inverse = _upper_solve(border[:, :m], np.eye(m))
     J = np.zeros((d + m, d + m))
     J[d:, d:] = inverse @ inverse.T
-    for k in range(n - 1, -1, -1):
+    for k in range(n - 1, first - 1, -1):
         row = conditionals[k]
         inverse = _upper_solve(row[:, :d], np.eye(d))
         G = inverse @ row[:, d : 2 * d + m].copy()
         GJ = G @ J
         cov = inverse @ inverse.T + GJ @ G.T
-        out[k] = 0.5 * (cov + cov.T)
-        J[:d, :d] = out[k]
+        out[k - first] = 0.5 * (cov + cov.T)
+        J[:d, :d] = out[k - first]
         J[:d, d:] = -GJ[:, d:]
         J[d:, :d] = -GJ[:, d:].T
     return out, J[d:, d:].copy()
@@ -192,9 +192,9 @@ class Elimination:
         """x (n, d) and c (m,) of least squares."""
         return _back(self.conditionals, self.border, self.n, self.d, self.m)
 
-    def covariances(self) -> tuple[Floats, Floats]:
-        """Marginal covariances: (n, d, d) of the keyframes and (m, m) of the constants."""
-        return _covariances(self.conditionals, self.border, self.n, self.d, self.m)
+    def covariances(self, first: int = 0) -> tuple[Floats, Floats]:
+        """Marginal covariances: (n - first, d, d) of the keyframes from ``first`` on and (m, m) of the constants."""
+        return _covariances(self.conditionals, self.border, first, self.n, self.d, self.m)
 
     def undetermined(self) -> list[tuple[int, int]]:
         """Unknowns that no row determines: (keyframe, index), keyframe -1 for a constant."""

@@ -18,7 +18,7 @@ from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
 from tbmfg.problem import Problem
 from tbmfg.smoother import graph
-from tbmfg.smoother.chain import Block, eliminate, marginal
+from tbmfg.smoother.chain import Block, Elimination, eliminate, marginal
 from tbmfg.smoother.graph import States
 from tbmfg.smoother.online import REANCHOR_INFLATION, Online
 from tbmfg.timeseries import Floats
@@ -27,6 +27,7 @@ from tbmfg.timeseries import Floats
 # order, rotation times velocity, are below 0.1 mm/s then.
 MOVED_ROT, MOVED_VEL = 3e-3, 3e-2
 MOST_ITERATIONS = 4
+BUNCH = 0.125  # of the lag that a keyframe may stay beyond it: they leave together, which costs less
 
 
 class _Window:
@@ -45,6 +46,7 @@ class _Window:
             np.zeros(0, dtype=int), *np.zeros((2, 0, 15, d)), np.zeros((0, 15, len(free))), np.zeros((0, 15))
         )
         self.times, self.zero = problem.keyframes_s, graph.no_bias(2)
+        self.chain: Elimination | None = None  # as solved last
 
     def extend(self) -> None:
         """Add the next keyframe, where the IMU says that it is."""
@@ -78,22 +80,30 @@ class _Window:
                 raise ArithmeticError(f"the state at keyframe {self.first + newest} is not finite")
             if not self._relinearise() and not doubted:
                 break
-        self.cov, self.c_cov = chain.covariances()
+        self.chain = chain
 
-    def record(self, n: int, out: Online) -> None:
-        """Keep the window's keyframe n as it was solved last, with the residuals of its rows."""
-        k = self.first + n
-        out.last_x[k], out.last_cov[k] = self.x[n], self.cov[n]
-        out.residuals(self.problem, k, self.c)
+    def leave(self, count: int, out: Online) -> None:
+        """Let the oldest ``count`` keyframes leave, one at least stays; kept in ``out`` as they were solved last."""
+        self._keep(count, out)
+        for _ in range(count):
+            self.left = marginal(self._blocks(1)[0], self.problem.size, len(self.free))
+            self.left_at = States(self.x[1:2].copy(), self.c.copy())
+            self.x, self.first = self.x[1:], self.first + 1
+            self.factors.pop(0)
+            self.imu_at, imu = self.imu_at[1:], self.imu
+            self.imu = Block(imu.i[:-1], imu.A_i[1:], imu.A_j[1:], imu.A_c[1:], imu.b[1:])
 
-    def drop(self) -> None:
-        """Let the oldest keyframe leave."""
-        self.left = marginal(self._blocks(1)[0], self.problem.size, len(self.free))
-        self.left_at = States(self.x[1:2].copy(), self.c.copy())
-        self.x, self.cov, self.first = self.x[1:], self.cov[1:], self.first + 1
-        self.factors.pop(0)
-        self.imu_at, imu = self.imu_at[1:], self.imu
-        self.imu = Block(imu.i[:-1], imu.A_i[1:], imu.A_j[1:], imu.A_c[1:], imu.b[1:])
+    def close(self, out: Online, solved: int) -> None:
+        """Keep the first ``solved`` keyframes of the window, and the constants, as the last ones."""
+        out.c, out.c_cov[np.ix_(self.free, self.free)] = self.c.copy(), self._keep(solved, out)
+
+    def _keep(self, count: int, out: Online) -> Floats:
+        """Oldest ``count`` keyframes into ``out``, with their rows' residuals; the covariance of the constants."""
+        cov, c_cov = self.chain.covariances()
+        for n, k in enumerate(range(self.first, self.first + count)):
+            out.last_x[k], out.last_cov[k] = self.x[n], cov[n]
+            out.residuals(self.problem, k, self.c)
+        return c_cov
 
     def _relinearise(self) -> bool:
         """Linearise the IMU factors whose states have moved; whether there were any."""
@@ -138,25 +148,22 @@ def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None
     window = _Window(problem, free, 0, problem.prior.x, problem.prior.filter_cov)
     for k in range(len(times)):
         if k > 0:
+            if times[window.first] < times[k] - (1.0 + BUNCH) * lag_s:
+                leaving = np.searchsorted(times, times[k] - lag_s) - window.first
+                window.leave(min(leaving, k - 1 - window.first), out)
             window.extend()
-            while window.first < k and times[window.first] < times[k] - lag_s:
-                window.record(0, out)
-                window.drop()
         guess = window.x[-1]
         try:
             window.solve()
         except (ArithmeticError, np.linalg.LinAlgError) as error:
             if k == 0:
                 raise EstimationError(f"not determined at the start: {error}; give priors in the rig") from error
-            for n in range(k - window.first):
-                window.record(n, out)
+            window.close(out, k - window.first)
             window = _Window(problem, free, k, guess, out.causal_cov[k - 1] * REANCHOR_INFLATION)
             window.solve()
             out.reanchored.append((k, str(error)))
-        out.causal_x[k], out.causal_cov[k] = window.x[-1], window.cov[-1]
+        out.causal_x[k], out.causal_cov[k] = window.x[-1], window.chain.covariances(k - window.first)[0][0]
         if progress is not None and k % 50 == 0:
             progress(k / len(times))
-    for n in range(len(window.x)):
-        window.record(n, out)
-    out.c, out.c_cov[np.ix_(free, free)] = window.c, window.c_cov
+    window.close(out, len(window.x))
     return out
