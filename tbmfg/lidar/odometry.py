@@ -1,0 +1,165 @@
+"""LiDAR odometry: KISS-ICP finds the scan, planes refine it and say what it tells.
+
+KISS-ICP (Vizzo et al. 2023) gives a pose and no doubt, and in a tunnel it slides along the axis. So its pose is where a
+registration on planes starts, which holds the directions that the walls do not tell at the prediction, and gives the
+information of the others. The map of both is made of the refined poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tbmfg.geometry import log_so3
+from tbmfg.lidar import registration
+from tbmfg.lidar.clouds import Scan
+from tbmfg.lidar.motion import Blind, Inertia, compensate
+from tbmfg.lidar.surfels import SurfelMap
+from tbmfg.rig import Lidar
+from tbmfg.timeseries import Floats
+
+LEAST_POINTS = 100  # of a scan that can be registered
+FITS = 0.5  # least share of the points near planes that lie on them; below, the scan is not believed
+LOST = 20  # such scans in a row after which the map begins anew
+NEAREST_SD = (2e-4, 1e-3)  # rad and m: no scan is known better than this, whatever its many points say
+FORGET_EVERY = 50  # scans after which what is out of range is forgotten
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where one scan was taken: R (3, 3), p (3,) m of the LiDAR in the map, at ``t_s`` s, the time of its last point.
+
+    ``root`` (6, 6): square root S of the information S' S of the step from the scan before, as a right perturbation
+    [rotation, position] of this pose; zero rows where there is none. ``overlap`` is the share of the points near planes of
+    the map that lie on them, ``sigma`` the noise of their distances [m], ``weak`` the number of directions that the walls do not tell,
+    ``dust`` the share of near points that hang in the air. ``healthy``: the scan fits the map.
+    """
+
+    t_s: float
+    R: Floats
+    p: Floats
+    root: Floats
+    overlap: float
+    sigma: float
+    weak: int
+    dust: float
+    healthy: bool
+
+
+class Odometry:
+    """Scan after scan onto a map that grows by them; memory goes with the map within the LiDAR's range."""
+
+    def __init__(self, sensor: Lidar, motion: Inertia | Blind) -> None:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+
+        config = load_config(None)
+        config.mapping.voxel_size = sensor.voxel
+        config.data.max_range, config.data.min_range = sensor.max_range, sensor.min_range
+        self.sensor, self.motion = sensor, motion
+        self.kiss = KissICP(config)
+        self.planes = SurfelMap(sensor.voxel)
+        self.velocity_0 = np.zeros(3)
+        self.last: Pose | None = None
+        self.unfit = self.restarts = self.scans = 0
+
+    def register(self, scan: Scan, start_s: float) -> Pose | None:
+        """The pose of a scan whose stamp is ``start_s`` s; None for one of too few points."""
+        if len(scan.points) < LEAST_POINTS:
+            return None
+        points, t_s = scan.points, start_s
+        if scan.after_s is not None:
+            t_s = start_s + float(scan.after_s.max())
+            points = compensate(points, start_s + scan.after_s, t_s, self.motion, self.velocity_0)
+        if self.last is not None and t_s <= self.last.t_s:
+            return None
+        self.scans += 1
+        source, dense = self.kiss.voxelize(points)
+        if self.last is None:
+            R, p = (part[0] for part in self.motion.poses(np.array([t_s]), self.velocity_0))
+            return self._begin(t_s, R, p, points, dense)
+        prior = self._predicted(t_s)
+        found = self._align(source, dense, prior)
+        if found.overlap < FITS:
+            self.unfit += 1
+            if self.unfit >= LOST:
+                self.restarts += 1
+                return self._begin(t_s, *prior, points, dense)
+            self.last = Pose(t_s, *prior, np.zeros((6, 6)), found.overlap, found.sigma, 6, 1.0, False)
+            return self.last
+        self.unfit = 0
+        self._learn_velocity(t_s, found.R, found.p)
+        root = whitening(found.information, self.sensor.noise_factor)
+        weak = found.weak.shape[1]
+        self._extend(found.R, found.p, points, dense)
+        self.last = Pose(t_s, found.R, found.p, root, found.overlap, found.sigma, weak, 0.0, True)
+        return self.last
+
+    def _predicted(self, t_s: float) -> tuple[Floats, Floats]:
+        """The last pose, moved on."""
+        R, p = self.motion.poses(np.array([self.last.t_s, t_s]), self.velocity_0)
+        turn, shift = R[0].T @ R[1], R[0].T @ (p[1] - p[0])
+        return self.last.R @ turn, self.last.p + self.last.R @ shift
+
+    def _align(self, source: Floats, dense: Floats, prior: tuple[Floats, Floats]) -> registration.Aligned:
+        """Onto the planes from KISS-ICP's pose."""
+        sigma = self.kiss.adaptive_threshold.get_threshold()
+        T = self.kiss.registration.align_points_to_map(
+            points=source,
+            voxel_map=self.kiss.local_map,
+            initial_guess=matrix(*prior),
+            max_correspondance_distance=3 * sigma,
+            kernel=sigma,
+        )
+        found = registration.align(source, (T[:3, :3], T[:3, 3]), prior, self.planes)
+        deviation = np.linalg.inv(matrix(*prior)) @ matrix(found.R, found.p)
+        self.kiss.adaptive_threshold.update_model_deviation(deviation)
+        return found
+
+    def _begin(self, t_s: float, R: Floats, p: Floats, points: Floats, dense: Floats) -> Pose:
+        """A new map from one scan."""
+        self.unfit, self.planes = 0, SurfelMap(self.sensor.voxel)
+        self.kiss.local_map.clear()
+        self._extend(R, p, points, dense)
+        self.last = Pose(t_s, R, p, np.zeros((6, 6)), 1.0, 0.0, 6, 0.0, True)
+        return self.last
+
+    def _extend(self, R: Floats, p: Floats, points: Floats, dense: Floats) -> None:
+        self.kiss.local_map.update(dense, matrix(R, p))
+        self.planes.add(points @ R.T + p)
+        if self.scans % FORGET_EVERY == 0:
+            self.planes.keep_near(p, self.sensor.max_range)
+
+    def _learn_velocity(self, t_s: float, R: Floats, p: Floats) -> None:
+        """What a LiDAR without an odometer is taken to go on with, in the axes that ``motion`` has."""
+        R_0, _ = self.motion.poses(np.array([self.last.t_s]), self.velocity_0)
+        self.velocity_0 = R_0[0] @ self.last.R.T @ (p - self.last.p) / (t_s - self.last.t_s)
+
+
+def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Blind) -> Iterator[Pose | None]:
+    """Poses of scans with their stamps in s, one by one; None for scans that cannot be registered."""
+    odometry = Odometry(sensor, motion)
+    for scan, start_s in scans:
+        yield odometry.register(scan, start_s)
+
+
+def whitening(information: Floats, noise_factor: float) -> Floats:
+    """Square root S of an information matrix, S' S, with sds no smaller than the least ones; (6, 6)."""
+    scale = np.repeat(NEAREST_SD, 3)
+    value, vector = np.linalg.eigh(information * np.outer(scale, scale))
+    value = np.maximum(value, 0.0)
+    return (np.sqrt(value / (1.0 + value)) / noise_factor)[:, None] * vector.T / scale
+
+
+def matrix(R: Floats, p: Floats) -> Floats:
+    """Pose as (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    return T
+
+
+def error(R: Floats, p: Floats, R_true: Floats, p_true: Floats) -> Floats:
+    """Right perturbation [rotation, position] from a true pose to another, (6,)."""
+    return np.concatenate([log_so3(R_true.T @ R), R_true.T @ (p - p_true)])

@@ -1,0 +1,115 @@
+"""A scan on a map of planes: the pose, and which directions of it the planes tell.
+
+Errors of a pose are right perturbations [rotation, position] in the LiDAR's axes. The Hessian of the distances to the
+planes shows where a pose may slide; but normals that are noisy by a few degrees pretend to hold it everywhere. What that
+noise alone would contribute is computed beside the Hessian, and a direction counts only where it stands out against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import eigh
+
+from tbmfg.geometry import exp_so3, log_so3
+from tbmfg.lidar.surfels import SurfelMap, nearest_plane
+from tbmfg.timeseries import Floats
+
+STANDS_OUT = 5.0  # least ratio of a direction's information to what noise of the normals would give
+TILT_SD = 0.01  # rad, of the normals beside what their points' scatter tells: walls are not planes
+FEW = 30  # points of a plane beyond which its normal gets no better: their errors are not independent
+SIGMA_M = (0.005, 0.3)  # limits of the distances' noise
+KERNEL = 2.0  # sds at which a distance has a quarter of its weight
+ON = 0.2  # largest distance of a point on a plane, in voxels
+LEAST_NEAR = 30  # points near planes that can be registered
+ITERATIONS = 12
+STILL = 1e-4  # m and rad: a step that ends the iteration
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """Pose R (3, 3), p (3,) of a scan in the map, ``information`` (6, 6), ``weak`` directions (6, k) that have none.
+
+    ``overlap`` is the share of the points near a plane that lie on it, ``sigma`` the noise of their distances [m].
+    """
+
+    R: Floats
+    p: Floats
+    information: Floats
+    weak: Floats
+    overlap: float
+    sigma: float
+
+
+def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Floats], planes: SurfelMap) -> Aligned:
+    """Gauss-Newton on the distances of ``points`` (n, 3) to ``planes``, from ``start``.
+
+    In directions that the planes do not tell the pose is that of ``prior``: Zhang et al. (2016), with the test above.
+    """
+    (R, p), sigma = start, SIGMA_M[1]
+    table = planes.voxel, planes.keys, planes.surfels
+    for iteration in range(ITERATIONS):
+        H, g, F, distance = linearise(points, R, p, *table, KERNEL * sigma)
+        found = distance[np.isfinite(distance)]
+        if len(found) < LEAST_NEAR:
+            return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, SIGMA_M[1])
+        sigma = float(np.clip(1.4826 * np.median(np.abs(found)), *SIGMA_M))
+        ratio, V = eigh(H, F)
+        weak = ratio < STANDS_OUT
+        inverse = V.T @ F
+        if iteration == 0 and weak.any():
+            off = np.concatenate([log_so3(prior[0].T @ R), prior[0].T @ (p - prior[1])])
+            step = V @ np.where(weak, 0.0, inverse @ off)
+            R, p = prior[0] @ exp_so3(step[:3]), prior[1] + prior[0] @ step[3:]
+            continue
+        step = -V @ np.where(weak, 0.0, (V.T @ g) / ratio)
+        R, p = R @ exp_so3(step[:3]), p + R @ step[3:]
+        if np.abs(step).max() < STILL:
+            break
+    strength = np.where(weak, 0.0, ratio - 1.0) / sigma**2
+    information = inverse.T @ (strength[:, None] * inverse)
+    overlap = float(np.mean(np.abs(found) < ON * planes.voxel))
+    return Aligned(R, p, information, V[:, weak], overlap, sigma)
+
+
+@njit(cache=True)
+def linearise(points, R, p, voxel, keys, surfels, kernel):
+    """Hessian H and gradient g of half the weighted squared distances, what noise of the normals adds to H on average
+    (F), and the distances (n,), NaN where there is no plane."""
+    H, F, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+    distance = np.full(len(points), np.nan)
+    J = np.empty((3, 6))
+    for n in range(len(points)):
+        q = points[n]
+        x = R[0, 0] * q[0] + R[0, 1] * q[1] + R[0, 2] * q[2] + p[0]
+        y = R[1, 0] * q[0] + R[1, 1] * q[1] + R[1, 2] * q[2] + p[1]
+        z = R[2, 0] * q[0] + R[2, 1] * q[1] + R[2, 2] * q[2] + p[2]
+        row = nearest_plane(x, y, z, voxel, keys, surfels)
+        if row < 0:
+            continue
+        s = surfels[row]
+        r = s[3] * (x - s[0]) + s[4] * (y - s[1]) + s[5] * (z - s[2])
+        distance[n] = r
+        w = 1.0 / (1.0 + (r / kernel) ** 2) ** 2
+        # the normal and the two directions into which it may tilt, each as a direction of measurement
+        for d in range(3):
+            u = s[3 + 3 * d : 6 + 3 * d]
+            for a in range(3):
+                J[d, 3 + a] = R[0, a] * u[0] + R[1, a] * u[1] + R[2, a] * u[2]
+            J[d, 0] = q[1] * J[d, 5] - q[2] * J[d, 4]
+            J[d, 1] = q[2] * J[d, 3] - q[0] * J[d, 5]
+            J[d, 2] = q[0] * J[d, 4] - q[1] * J[d, 3]
+        points_of_plane = min(s[15], FEW)
+        t1 = w * (s[12] / (points_of_plane * s[13]) + TILT_SD**2)
+        t2 = w * (s[12] / (points_of_plane * s[14]) + TILT_SD**2)
+        for a in range(6):
+            g[a] += w * r * J[0, a]
+            for b in range(a + 1):
+                H[a, b] += w * J[0, a] * J[0, b]
+                F[a, b] += t1 * J[1, a] * J[1, b] + t2 * J[2, a] * J[2, b]
+    for a in range(6):
+        for b in range(a):
+            H[b, a], F[b, a] = H[a, b], F[a, b]
+    return H, g, F, distance
