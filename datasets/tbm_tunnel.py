@@ -25,7 +25,7 @@ SWAY_DEG, SWAY_S = 1.5, 20.0
 WALLS = ("smooth", "ribbed")
 
 LIDAR = "sensors.lidar={topic: /points, T_bl: {xyz_m: [0.5, 0.0, 0.8], rpy_deg: [0.5, -1.0, 1.5]}}"
-SETTING = (LIDAR, "sensors.odometer.scale_sd=0.003", "sensors.odometer.sigma_mps=0.005")
+SETTING = (LIDAR, "sensors.odometer.scale_sd=0.003")
 SENSORS = ("imu", "odometer", "lidar")
 
 

@@ -121,6 +121,11 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             found[f"{sensor}_mounting_yaw_pitch_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
         elif what == "declination":
             found[f"{sensor}_declination_deg"] = Calibrated(np.rad2deg(c[k]), np.rad2deg(sd[k]), estimated)
+        elif what == "mount_x":
+            three, turn = slice(k, k + 3), slice(k + 3, k + 6)
+            found[f"{sensor}_mounting_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
+            degrees = np.rad2deg(c[turn]), np.rad2deg(sd[turn])
+            found[f"{sensor}_mounting_turn_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), k + 3 in free)
         elif what == "scale":
             found[f"{sensor}_scale"] = Calibrated(c[k], sd[k], estimated)
     return found

@@ -255,6 +255,11 @@ class Odometer(Sensor):
     mounting_sd = si("mounting_sd_deg", DEG)
     clock_offset = si("clock_offset_s")
 
+    @property
+    def ahead(self) -> Floats:
+        """The odometer's forward axis in b, (3,)."""
+        return _rotation((0.0, self.pitch_deg, self.yaw_deg))[:, 0]
+
 
 class Magnetometer(Sensor):
     """Direction of the horizontal magnetic field. The default sd is for a calibrated unit beside steel."""

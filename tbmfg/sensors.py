@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from tbmfg.geometry import exp_so3, log_so3, skew
 from tbmfg.timeseries import Floats
 
 
@@ -223,8 +224,50 @@ def bounded(z, data, xi, xj, c):
     return xi[:, 9:15] - z, Ji, np.zeros((n, 6, 0)), np.zeros((n, 6, 0))
 
 
+def lidar(z, data, xi, xj, c):
+    """Pose of a LiDAR at one scan as seen from the scan before, whitened by the square root of its information.
+
+    z (12): R (9, row by row) and p [m]. data (71): for the scans at i and j how the body moves on from its keyframe to
+    the scan, a time dt, s (3) in b with p + v dt + R s, and a rotation C (9); then the mounting's known rotation
+    R_bl (9) and the root S (36). c (6): LiDAR in b [m], and a rotation vector d: its axes are R_bl Exp(d).
+    r = S [Log(R^T R_h), R^T (p_h - p)]: the error of the pose at j as a right perturbation.
+    """
+    n, d = len(z), xi.shape[1] - 6
+    R_bl = data[:, 26:35].reshape(n, 3, 3) @ exp_so3(c[3:])
+    ends = []
+    for x, own in ((xi, data[:, :13]), (xj, data[:, 13:26])):
+        R, s, C = x[:, :9].reshape(n, 3, 3), own[:, 1:4], own[:, 4:].reshape(n, 3, 3)
+        carried = R @ C
+        at = x[:, 9:12] + x[:, 12:15] * own[:, :1] + (R @ s[:, :, None])[:, :, 0] + carried @ c[:3]
+        # what a turn of the keyframe does to the LiDAR: its axes by C_l, its place by lever
+        C_l = (C @ R_bl).swapaxes(1, 2)
+        lever = -R @ (skew(s) + skew(C @ c[:3]))
+        ends.append((carried @ R_bl, at, own[:, :1, None], C_l, lever, carried))
+    (R_li, p_i, dt_i, C_i, lever_i, A_i), (R_lj, p_j, dt_j, C_j, lever_j, A_j) = ends
+    to_i, Z = R_li.swapaxes(1, 2), z[:, :9].reshape(n, 3, 3).swapaxes(1, 2)
+    R_h, p_h = to_i @ R_lj, (to_i @ (p_j - p_i)[:, :, None])[:, :, 0]
+    turn = log_so3(Z @ R_h)
+    back, Z_to_i = R_h.swapaxes(1, 2), Z @ to_i
+    half = np.eye(3) + 0.5 * skew(turn) + skew(turn) @ skew(turn) / 12  # of Log, to the second order
+
+    e = np.hstack([turn, (Z @ (p_h - z[:, 9:])[:, :, None])[:, :, 0]])
+    Ji, Jj, Jc = np.zeros((n, 6, d)), np.zeros((n, 6, d)), np.zeros((n, 6, 6))
+    Ji[:, :3, :3] = -half @ back @ C_i
+    Ji[:, 3:, :3] = Z @ skew(p_h) @ C_i - Z_to_i @ lever_i
+    Ji[:, 3:, 3:6], Ji[:, 3:, 6:9] = -Z_to_i, -Z_to_i * dt_i
+    Jj[:, :3, :3] = half @ C_j
+    Jj[:, 3:, :3] = Z_to_i @ lever_j
+    Jj[:, 3:, 3:6], Jj[:, 3:, 6:9] = Z_to_i, Z_to_i * dt_j
+    onto = np.eye(3) - 0.5 * skew(c[3:])  # of Exp, to the first order: mountings are known to degrees
+    Jc[:, 3:, :3] = Z_to_i @ (A_j - A_i)
+    Jc[:, :3, 3:] = half @ (np.eye(3) - back) @ onto
+    Jc[:, 3:, 3:] = Z @ skew(p_h) @ onto
+    S = data[:, 35:].reshape(n, 6, 6)
+    return (S @ e[:, :, None])[:, :, 0], S @ Ji, S @ Jj, S @ Jc
+
+
 MODELS: dict[str, Callable] = {
-    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, bounded)
+    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, bounded, lidar)
 }
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tbmfg.errors import LogError
 from tbmfg.rig import Lidar
-from tbmfg.timeseries import Floats
+from tbmfg.timeseries import NS, Floats
 
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset")
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -79,9 +79,11 @@ def _times(t_ns: int, fields: dict[str, NDArray], sensor: Lidar, period_s: float
     if abs(first) * unit < EPOCH_S and abs(first) * unit <= LONGEST_PERIODS * period_s:
         return values * unit, ""
     # absolute times: integers keep their nanoseconds; those of another clock begin at the stamp
-    whole = np.issubdtype(raw.dtype, np.integer)
-    origin = round(t_ns * 1e-9 / unit) if whole else t_ns * 1e-9 / unit
-    after_s = (raw.astype(np.int64) - origin) * unit if whole else (values - origin) * unit
+    if np.issubdtype(raw.dtype, np.integer):
+        whole, rest_ns = divmod(t_ns, round(unit * NS))
+        after_s = (raw.astype(np.int64) - whole) * unit - rest_ns / NS
+    else:
+        after_s = values * unit - t_ns / NS
     if abs(np.nanmin(after_s)) > LONGEST_PERIODS * period_s:
         return (values - first) * unit, ""
     return after_s, ""

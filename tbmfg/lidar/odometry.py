@@ -32,9 +32,9 @@ class Pose:
     """Where one scan was taken: R (3, 3), p (3,) m of the LiDAR in the map, at ``t_s`` s, the time of its last point.
 
     ``root`` (6, 6): square root S of the information S' S of the step from the scan before, as a right perturbation
-    [rotation, position] of this pose; zero rows where there is none. ``overlap`` is the share of the points near planes of
-    the map that lie on them, ``sigma`` the noise of their distances [m], ``weak`` the number of directions that the walls do not tell,
-    ``dust`` the share of near points that hang in the air. ``healthy``: the scan fits the map.
+    [rotation, position] of this pose; zero rows where there is none. ``overlap``: share of the points near planes of
+    the map that lie on them; ``sigma``: noise of their distances [m]; ``weak``: directions that the walls do not tell;
+    ``dust``: share of the near points that hang in the air. ``healthy``: the scan fits the map.
     """
 
     t_s: float
@@ -87,14 +87,14 @@ class Odometry:
             if self.unfit >= LOST:
                 self.restarts += 1
                 return self._begin(t_s, *prior, points, dense)
-            self.last = Pose(t_s, *prior, np.zeros((6, 6)), found.overlap, found.sigma, 6, 1.0, False)
+            self.last = Pose(t_s, *prior, np.zeros((6, 6)), found.overlap, found.sigma, 6, found.dust, False)
             return self.last
         self.unfit = 0
-        self._learn_velocity(t_s, found.R, found.p)
+        self._learn_velocity(t_s, found)
         root = whitening(found.information, self.sensor.noise_factor)
         weak = found.weak.shape[1]
         self._extend(found.R, found.p, points, dense)
-        self.last = Pose(t_s, found.R, found.p, root, found.overlap, found.sigma, weak, 0.0, True)
+        self.last = Pose(t_s, found.R, found.p, root, found.overlap, found.sigma, weak, found.dust, True)
         return self.last
 
     def _predicted(self, t_s: float) -> tuple[Floats, Floats]:
@@ -132,10 +132,18 @@ class Odometry:
         if self.scans % FORGET_EVERY == 0:
             self.planes.keep_near(p, self.sensor.max_range)
 
-    def _learn_velocity(self, t_s: float, R: Floats, p: Floats) -> None:
-        """What a LiDAR without an odometer is taken to go on with, in the axes that ``motion`` has."""
+    def _learn_velocity(self, t_s: float, found: registration.Aligned) -> None:
+        """What a LiDAR without an odometer is taken to go on with, in the axes that ``motion`` has.
+
+        Where the walls tell nothing, standing is the guess that cannot run away.
+        """
+        velocity_l = self.last.R.T @ (found.p - self.last.p) / (t_s - self.last.t_s)
+        if found.weak.shape[1]:
+            slides, size, _ = np.linalg.svd(found.weak[3:])
+            slides = slides[:, : len(size)][:, size > 0.1 * np.linalg.norm(found.weak, axis=0).max()]
+            velocity_l -= slides @ (slides.T @ velocity_l)
         R_0, _ = self.motion.poses(np.array([self.last.t_s]), self.velocity_0)
-        self.velocity_0 = R_0[0] @ self.last.R.T @ (p - self.last.p) / (t_s - self.last.t_s)
+        self.velocity_0 = R_0[0] @ velocity_l
 
 
 def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Blind) -> Iterator[Pose | None]:
@@ -149,7 +157,7 @@ def whitening(information: Floats, noise_factor: float) -> Floats:
     """Square root S of an information matrix, S' S, with sds no smaller than the least ones; (6, 6)."""
     scale = np.repeat(NEAREST_SD, 3)
     value, vector = np.linalg.eigh(information * np.outer(scale, scale))
-    value = np.maximum(value, 0.0)
+    value = np.where(value > 1e-12 * max(value[-1], 1.0), value, 0.0)  # what rounding leaves of a weak direction
     return (np.sqrt(value / (1.0 + value)) / noise_factor)[:, None] * vector.T / scale
 
 

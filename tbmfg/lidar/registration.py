@@ -1,8 +1,8 @@
 """A scan on a map of planes: the pose, and which directions of it the planes tell.
 
 Errors of a pose are right perturbations [rotation, position] in the LiDAR's axes. The Hessian of the distances to the
-planes shows where a pose may slide; but normals that are noisy by a few degrees pretend to hold it everywhere. What that
-noise alone would contribute is computed beside the Hessian, and a direction counts only where it stands out against it.
+planes shows where a pose may slide; but normals that are noisy by a few degrees pretend to hold it everywhere. What
+that noise alone would contribute is computed beside it, and a direction counts only where it stands out against that.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from tbmfg.geometry import exp_so3, log_so3
 from tbmfg.lidar.surfels import SurfelMap, nearest_plane
 from tbmfg.timeseries import Floats
 
-STANDS_OUT = 5.0  # least ratio of a direction's information to what noise of the normals would give
+STANDS_OUT = 4.0  # least ratio of a direction's information to what noise of the normals would give
 TILT_SD = 0.01  # rad, of the normals beside what their points' scatter tells: walls are not planes
-FEW = 30  # points of a plane beyond which its normal gets no better: their errors are not independent
+FEW = 10  # points of a plane beyond which its normal gets no better: errors within a scan are not independent
 SIGMA_M = (0.005, 0.3)  # limits of the distances' noise
 KERNEL = 2.0  # sds at which a distance has a quarter of its weight
 ON = 0.2  # largest distance of a point on a plane, in voxels
@@ -32,7 +32,8 @@ STILL = 1e-4  # m and rad: a step that ends the iteration
 class Aligned:
     """Pose R (3, 3), p (3,) of a scan in the map, ``information`` (6, 6), ``weak`` directions (6, k) that have none.
 
-    ``overlap`` is the share of the points near a plane that lie on it, ``sigma`` the noise of their distances [m].
+    ``overlap`` is the share of the points near a plane that lie on it, ``sigma`` the noise of their distances [m],
+    ``dust`` the share without a plane among the points nearer than most that have one.
     """
 
     R: Floats
@@ -41,6 +42,7 @@ class Aligned:
     weak: Floats
     overlap: float
     sigma: float
+    dust: float
 
 
 def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Floats], planes: SurfelMap) -> Aligned:
@@ -54,7 +56,7 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
         H, g, F, distance = linearise(points, R, p, *table, KERNEL * sigma)
         found = distance[np.isfinite(distance)]
         if len(found) < LEAST_NEAR:
-            return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, SIGMA_M[1])
+            return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, SIGMA_M[1], 1.0)
         sigma = float(np.clip(1.4826 * np.median(np.abs(found)), *SIGMA_M))
         ratio, V = eigh(H, F)
         weak = ratio < STANDS_OUT
@@ -71,7 +73,9 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
     strength = np.where(weak, 0.0, ratio - 1.0) / sigma**2
     information = inverse.T @ (strength[:, None] * inverse)
     overlap = float(np.mean(np.abs(found) < ON * planes.voxel))
-    return Aligned(R, p, information, V[:, weak], overlap, sigma)
+    ranges, alone = np.linalg.norm(points, axis=1), np.isnan(distance)
+    dust = float(np.mean(alone[ranges <= np.median(ranges[~alone])]))
+    return Aligned(R, p, information, V[:, weak], overlap, sigma, dust)
 
 
 @njit(cache=True)

@@ -13,9 +13,9 @@ import numpy as np
 from tbmfg import gnss
 from tbmfg.errors import EstimationError, RigError
 from tbmfg.inertial.steps import to_ns
-from tbmfg.prepare import search
+from tbmfg.prepare import scans, search
 from tbmfg.prepare.samples import ALONE, imu_steps, is_position, losses, usable_samples
-from tbmfg.prepare.start import align
+from tbmfg.prepare.start import align, parameters_of
 from tbmfg.problem import Problem, breakdown_explained
 from tbmfg.rig import Rig
 from tbmfg.state import Interval
@@ -45,12 +45,16 @@ def prepare(
     steps, imu_counts = imu_steps(log, rig, outages, warnings)
     missing: list[str] = []
     samples, counts = usable_samples(log, rig, steps, outages, without, missing)
-    if not samples and rig.motion is None:
+    lidars = scans.present(log, rig, without)
+    if not samples and not lidars and rig.motion is None:
         raise EstimationError("; ".join([f"{log.path}: {ALONE}", *missing]))
     warnings += missing
     counts = {"imu": imu_counts, **counts}
     with breakdown_explained("preparing the estimate"):
         setup = align(rig, steps, samples, counts, warnings)
+        for name in lidars:
+            scans.register(log, name, setup, outages, lambda share: tell("LiDAR odometry", share))
+        setup.parameters = parameters_of(rig, setup.samples)
         offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
         problem = search.find(setup, offsets, tell)
     problem.intervals = [

@@ -9,9 +9,10 @@ import numpy as np
 from tbmfg import measure
 from tbmfg.errors import EstimationError
 from tbmfg.prepare.samples import ALONE, is_position
+from tbmfg.prepare.scans import lidar_rows
 from tbmfg.prepare.start import Setup
 from tbmfg.problem import Inertial, Prior, Problem
-from tbmfg.rig import Barometer, Magnetometer, Odometer, PositionSensor, kind_of
+from tbmfg.rig import Barometer, Lidar, Magnetometer, Odometer, PositionSensor, kind_of
 from tbmfg.state import BG, NAV, ROT
 from tbmfg.timeseries import Floats
 
@@ -34,7 +35,8 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
     parameters = replace(setup.parameters, mean=mean, start=begin)
 
     fixes = [s.t_s - offsets[name] for name, s in samples.items() if is_position(rig, name)]
-    fixes_s = np.sort(np.concatenate(fixes)) if fixes else np.zeros(0)
+    scans = [s.t_s for name, s in samples.items() if isinstance(rig.sensors[name], Lidar)]
+    fixes_s = np.sort(np.concatenate([*fixes, *scans])) if fixes or scans else np.zeros(0)
     edges = measure.keyframe_edges(rig.keyframes, steps.edges_s, end_s, fixes_s)
     keyframes = steps.edges_s[edges]
     rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
@@ -46,6 +48,8 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
             rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
         elif isinstance(sensor, Magnetometer):
             rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, rig.origin.x_axis_azimuth, calib))
+        elif isinstance(sensor, Lidar):
+            rows.append(lidar_rows(sensor, s, keyframes, setup, calib))
         elif isinstance(sensor, Barometer):
             rows.append(measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names)))
             drift_names.append(f"{name}.bias")

@@ -26,7 +26,7 @@ VALUES = {  # column of the series that each kind of sensor measures with
     "laser": lambda series: series["point"][:, :2],
 }
 ALONE = (
-    "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer or barometer as well, "
+    "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer, barometer or lidar too, "
     "or a motion bound in the rig"
 )
 LEAST_IMU = 3
@@ -105,6 +105,8 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
         series = log.clouds[sensor.topic] if series is None else series
         c = series.counts
         counts[name] = count = Counts(received=c.received, duplicate=c.duplicate, nonfinite=c.nonfinite)
+        if kind == "lidar" and name not in without:
+            continue  # not columns, but scans to be registered: ``scans``
         if name in without or kind not in VALUES:
             if name not in without:
                 warnings.append(

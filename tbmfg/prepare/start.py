@@ -13,7 +13,7 @@ from tbmfg.inertial.steps import Steps, compensate
 from tbmfg.measure import GyroFrame, Samples, gyro_frame
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import Parameters
-from tbmfg.rig import Magnetometer, Odometer, PositionSensor, Rig
+from tbmfg.rig import Lidar, Magnetometer, Odometer, PositionSensor, Rig
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats
 
@@ -231,5 +231,8 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
             entries += [(f"{name}.{axis}", getattr(sensor, axis), sensor.mounting_sd) for axis in ("yaw", "pitch")]
         elif isinstance(sensor, Magnetometer):
             entries += [(f"{name}.declination", sensor.declination, sensor.declination_sd)]
+        elif isinstance(sensor, Lidar):
+            entries += [(f"{name}.mount_{axis}", sensor.T_bl.xyz[k], sensor.xyz_sd) for k, axis in enumerate("xyz")]
+            entries += [(f"{name}.turn_{axis}", 0.0, sensor.rpy_sd) for axis in "xyz"]
     names, mean, sd = zip(*entries, strict=True) if entries else ((), (), ())
     return Parameters(tuple(names), np.array(mean, float), np.array(sd, float), np.array(mean, float))

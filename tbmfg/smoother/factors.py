@@ -21,7 +21,13 @@ from tbmfg.timeseries import Floats
 
 BIAS = slice(BA.start, NAV)
 # which parts of the keyframes i and j a model depends on, in the order of its factor's keys
-PARTS = {"odometer": ("XB", "X"), "magnetometer": ("X", ""), "barometer": ("XVD", ""), "bounded": ("XV", "")}
+PARTS = {
+    "odometer": ("XB", "X"),
+    "magnetometer": ("X", ""),
+    "barometer": ("XVD", ""),
+    "bounded": ("XV", ""),
+    "lidar": ("XV", "XV"),
+}
 SYMBOLS = {"X": X, "V": V, "B": B, "D": D}
 BLOCKS = {"X": slice(0, 6), "V": VEL, "B": BIAS, "D": slice(NAV, None)}
 

@@ -1,0 +1,133 @@
+"""LiDAR scans to measured steps: odometry once per log, and the rows that tie its poses to the keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from tbmfg.lidar import clouds
+from tbmfg.lidar.motion import Inertia
+from tbmfg.lidar.odometry import run
+from tbmfg.measure import Samples, nearest
+from tbmfg.prepare.samples import hidden
+from tbmfg.prepare.start import Setup
+from tbmfg.rig import Lidar, Odometer, Rig, kind_of
+from tbmfg.sensors import Rows
+from tbmfg.timeseries import Floats, Log, seconds
+
+CARRIED_S = 0.5  # longest time that the IMU carries a keyframe to a scan
+WORTH_SAYING = 0.05  # share of the scans from which a fault is a warning
+
+
+def present(log: Log, rig: Rig, without: tuple[str, ...]) -> list[str]:
+    """The LiDARs that there are scans of and that are not to be left out."""
+    return [name for name, s in rig.sensors.items() if kind_of(name) == "lidar" and name not in without
+            and s.topic in log.clouds]  # fmt: skip
+
+
+def register(
+    log: Log, name: str, setup: Setup, outages: tuple[tuple[str, float, float], ...], tell: Callable[[float], None]
+) -> None:
+    """Register the scans of the LiDAR ``name`` on a map, and put its poses (n, 48) among the samples of ``setup``: R,
+    p, and the square root of the information of the step from the pose before. Scans are read one by one."""
+    sensor: Lidar = setup.rig.sensors[name]
+    source, steps, count = log.clouds[sensor.topic], setup.steps, setup.counts[name]
+    stamps_s = seconds(source.t_ns, steps.t0_ns) - sensor.clock_offset
+    out = hidden(name, stamps_s + sensor.clock_offset, outages)
+    inside = (stamps_s >= steps.edges_s[0]) & (stamps_s <= steps.end_s)
+    period_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.1
+    faults: dict[str, int] = {}
+
+    def usable() -> Iterator[tuple[clouds.Scan, float]]:
+        for k, (t_ns, fields) in enumerate(source):
+            if k % 50 == 0:
+                tell(k / len(source))
+            if inside[k] and not out[k]:
+                scan = clouds.read(t_ns, fields, sensor, period_s)
+                if scan.fault:
+                    faults[scan.fault] = faults.get(scan.fault, 0) + 1
+                yield scan, stamps_s[k]
+
+    motion = Inertia(steps.edges_s, setup.frame.R_0t, _way(setup), sensor.T_bl.R, sensor.T_bl.xyz)
+    poses = list(run(usable(), sensor, motion))
+    known = [pose for pose in poses if pose is not None and pose.t_s <= steps.end_s]
+    count.outage = int(out.sum())
+    for what, number in (
+        ("hold too few points", sum(pose is None for pose in poses)),
+        ("do not fit the map", sum(not pose.healthy for pose in known)),
+        *faults.items(),
+    ):
+        if number > WORTH_SAYING * len(poses):
+            setup.warnings.append(f"{name}: {number} of {len(poses)} scans: {what}")
+    if len(known) < 2:
+        setup.warnings.append(f"{name}: {len(known)} of {len(source)} scans can be registered; it is not used")
+        return
+    values = np.array([np.concatenate([pose.R.ravel(), pose.p, pose.root.ravel()]) for pose in known])
+    setup.samples[name] = Samples(name, np.array([pose.t_s for pose in known]), values)
+
+
+def _way(setup: Setup) -> Floats | None:
+    """Way of b in the gyro's frame by the first odometer, (n + 1, 3) at the edges; None without one."""
+    for name, speeds in setup.samples.items():
+        sensor = setup.rig.sensors[name]
+        if isinstance(sensor, Odometer):
+            speed = np.interp(setup.steps.edges_s[:-1], speeds.t_s - sensor.clock_offset, speeds.values)
+            ahead = setup.frame.R_0t[:-1] @ sensor.ahead
+            step = ahead * (speed / (1.0 + sensor.scale) * setup.steps.dt)[:, None]
+            contact = np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
+            return contact - setup.frame.R_0t @ sensor.arm
+    return None
+
+
+def lidar_rows(sensor: Lidar, poses: Samples, keyframes_s: Floats, setup: Setup, calib: slice) -> Rows:
+    """Steps from scan to scan, each between the keyframe of its scan and the one before that.
+
+    The earlier scan is then carried from its keyframe, which need not be its own, by the IMU over some hundredths of a
+    second. Steps that tell nothing, or are too long for that, are left out.
+    """
+    t, R, p = poses.t_s, poses.values[:, :9].reshape(-1, 3, 3), poses.values[:, 9:12]
+    roots = poses.values[:, 12:].reshape(-1, 6, 6)
+    j = nearest(keyframes_s, t[1:])
+    i = np.maximum(j - 1, 0)
+    far = np.maximum(np.abs(t[:-1] - keyframes_s[i]), np.abs(t[1:] - keyframes_s[j]))
+    told = np.flatnonzero((j > 0) & (far <= CARRIED_S) & roots[1:].any(axis=(1, 2)))
+    i, j = i[told], j[told]
+    before = R[told].swapaxes(1, 2)
+    step = (before @ (p[told + 1] - p[told])[:, :, None])[:, :, 0]
+    z = np.hstack([(before @ R[told + 1]).reshape(-1, 9), step])
+    sway = _sway(setup)
+    data = np.hstack(
+        [
+            _carried(setup, sway, keyframes_s[i], t[told]),
+            _carried(setup, sway, keyframes_s[j], t[told + 1]),
+            np.tile(sensor.T_bl.R.ravel(), (len(told), 1)),
+            roots[told + 1].reshape(-1, 36),
+        ]
+    )
+    ones = np.ones(len(told), dtype=int)
+    return Rows(poses.sensor, "lidar", i, j, z, data, np.ones((len(told), 6)), calib, ones, sensor.loss)
+
+
+def _sway(setup: Setup) -> tuple[Floats, Floats]:
+    """Velocity and position by the accelerometers alone in the gyro's frame, (n + 1, 3) each: only differences over
+    fractions of a second mean something."""
+    dt = setup.steps.dt[:, None]
+    force = (setup.frame.R_0t[:-1] @ setup.acc[:, :, None])[:, :, 0]
+    gravity = setup.R_start.T @ [0.0, 0.0, -setup.rig.origin.gravity]
+    velocity = np.concatenate([np.zeros((1, 3)), np.cumsum((force + gravity) * dt, axis=0)])
+    middle = 0.5 * (velocity[1:] + velocity[:-1])
+    return velocity, np.concatenate([np.zeros((1, 3)), np.cumsum(middle * dt, axis=0)])
+
+
+def _carried(setup: Setup, sway: tuple[Floats, Floats], start_s: Floats, end_s: Floats) -> Floats:
+    """dt, s and C of the model ``lidar`` from keyframes to scans, (n, 13)."""
+    edges = setup.steps.edges_s
+    velocity, position = (
+        [np.stack([np.interp(t, edges, part[:, a]) for a in range(3)], axis=1) for t in (start_s, end_s)]
+        for part in sway
+    )
+    dt = end_s - start_s
+    R, R_end = setup.frame.at(start_s).swapaxes(1, 2), setup.frame.at(end_s)
+    s = (R @ (position[1] - position[0] - velocity[0] * dt[:, None])[:, :, None])[:, :, 0]
+    return np.hstack([dt[:, None], s, (R @ R_end).reshape(-1, 9)])

@@ -1,0 +1,221 @@
+"""LiDAR scans: their times, their compensation, what their registration tells and what it does not, and bad ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import datasets
+from benchmarks.runs import in_memory, true_states
+from tbmfg.errors import LogError
+from tbmfg.estimators import estimate
+from tbmfg.evaluation.metrics import trajectory_errors
+from tbmfg.geometry import exp_so3
+from tbmfg.lidar import clouds, registration
+from tbmfg.lidar.motion import Blind, Inertia, compensate
+from tbmfg.lidar.odometry import Odometry, whitening
+from tbmfg.lidar.surfels import SurfelMap
+from tbmfg.prepare import prepare
+from tbmfg.rig import Lidar
+
+T_NS = 1_700_000_000_123_456_789
+AFTER_S = np.linspace(0.0, 0.0999, 50)
+SENSOR = Lidar(topic="/points")
+
+
+def fields(**more):
+    rng = np.random.default_rng(1)
+    return {axis: rng.uniform(1.0, 9.0, 50).astype(np.float32) for axis in "xyz"} | more
+
+
+# ---- clouds ----
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "precision"),
+    [
+        ("time", AFTER_S.astype(np.float32), 1e-8),
+        ("time", (AFTER_S * 1e3).astype(np.float32), 1e-8),
+        ("offset_time", (AFTER_S * 1e6).astype(np.uint32), 1e-6),
+        ("t", np.round(AFTER_S * 1e9).astype(np.uint32), 1e-9),
+        ("timestamp", T_NS + np.round(AFTER_S * 1e9).astype(np.int64), 1e-9),
+        ("timestamp", T_NS * 1e-9 + AFTER_S, 5e-7),  # a float64 second of this century resolves 0.24 us
+        ("timestamp", 4e16 + AFTER_S * 1e9, 1e-8),  # ns since another clock's start
+    ],
+)
+def test_times_of_any_unit(name, values, precision):
+    scan = clouds.read(T_NS, fields(**{name: values}), SENSOR, 0.1)
+    assert scan.fault == ""
+    assert_allclose(scan.after_s, AFTER_S, atol=precision)
+
+
+def test_times_that_tell_nothing():
+    for values, why in ((np.full(50, 7.0), "one time"), (np.full(50, np.nan), "no finite"), (AFTER_S * 50, "span")):
+        scan = clouds.read(T_NS, fields(time=values), replace_unit("s"), 0.1)
+        assert scan.after_s is None
+        assert why in scan.fault
+    assert clouds.read(T_NS, fields(), SENSOR, 0.1).fault == ""
+
+
+def replace_unit(unit: str) -> Lidar:
+    return SENSOR.model_copy(update={"time_unit": unit})
+
+
+def test_fields_named_in_the_rig():
+    own = SENSOR.model_copy(update={"time_field": "when", "time_unit": "ms"})
+    assert_allclose(clouds.read(T_NS, fields(when=AFTER_S), own, 0.1).after_s, AFTER_S * 1e-3)
+    with pytest.raises(LogError, match="no field when"):
+        clouds.read(T_NS, fields(), own, 0.1)
+    with pytest.raises(LogError, match="without x, y and z"):
+        clouds.read(T_NS, {"range": AFTER_S}, SENSOR, 0.1)
+
+
+def test_points_left_out_are_counted():
+    cloud = fields(time=AFTER_S.copy())
+    cloud["x"][3], cloud["time"][4] = np.nan, np.inf
+    for axis in "xyz":
+        cloud[axis][:2], cloud[axis][7], cloud[axis][8] = 0.0, 0.1, 500.0
+    scan = clouds.read(T_NS, cloud, SENSOR, 0.1)
+    assert (scan.nonfinite, scan.zero, scan.beyond, len(scan.points), len(scan.after_s)) == (2, 2, 2, 44, 44)
+
+
+# ---- motion compensation ----
+
+
+@cache
+def tunnel(walls: str = "smooth", duration: float = 5.0):
+    return datasets.make("tbm-tunnel", seed=2, duration=duration, walls=walls, columns=150, imu_rate_hz=200.0)
+
+
+def test_compensated_points_lie_on_the_walls_from_the_last_pose():
+    simulation = tunnel()
+    mounting, t_s = simulation.rig.sensors["lidar"].T_bl, np.arange(0.0, 5.0, 0.005)
+    truth = simulation.truth(t_s)
+    motion = Inertia(t_s, truth.R, truth.position, mounting.R, mounting.xyz)
+    t_ns, cloud = list(simulation.clean["lidar"])[40]
+    start_s = (t_ns - simulation.start_ns) * 1e-9
+    points, own = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float), start_s + cloud["time"]
+    moved = compensate(points, own, own.max(), motion, np.zeros(3))
+    true = simulation.truth(own)
+    last = simulation.truth(own.max()[None])
+    in_n = true.position + np.einsum("nij,nj->ni", true.R, points @ mounting.R.T + mounting.xyz)
+    back = last.position + (moved @ mounting.R.T + mounting.xyz) @ last.R[0].T
+    # nearest attitude within an IMU period: 2.5 ms of 1 deg/s over 100 m; without compensation centimetres
+    assert np.abs(back - in_n).max() < 5e-3
+    raw = last.position + (points @ mounting.R.T + mounting.xyz) @ last.R[0].T
+    assert np.abs(raw - in_n).max() > 2e-2
+
+
+# ---- registration ----
+
+
+def tube(rng, count: int, sigma: float, length: float = 20.0):
+    """Points on the walls of a box of 3.8 x 2.8 m, open along x."""
+    x, y, z = rng.uniform(-length, length, count), rng.uniform(-1.9, 1.9, count), rng.uniform(-1.4, 1.4, count)
+    wall, side = rng.integers(0, 2, count), rng.choice([-1.0, 1.0], count)
+    y, z = np.where(wall == 0, 1.9 * side, y), np.where(wall == 1, 1.4 * side, z)
+    y, z = y + sigma * rng.standard_normal(count) * (wall == 0), z + sigma * rng.standard_normal(count) * (wall == 1)
+    return np.column_stack([x, y, z])
+
+
+def test_a_tunnel_tells_all_but_the_way_along_it():
+    rng = np.random.default_rng(4)
+    planes = SurfelMap(0.5)
+    planes.add(tube(rng, 60_000, 0.02))
+    R, p = exp_so3(np.array([0.01, -0.02, 0.015])), np.array([0.3, 0.04, -0.05])
+    scan = (tube(rng, 3000, 0.02) - p) @ R
+    prior = (np.eye(3), np.array([0.2, 0.0, 0.0]))
+    found = registration.align(scan, prior, prior, planes)
+    assert found.weak.shape[1] == 1
+    assert abs(found.weak[3, 0]) > 0.9 * np.linalg.norm(found.weak[3:, 0])
+    assert found.p[0] == pytest.approx(0.2, abs=0.02)  # stays at the prior, 0.1 m from the truth
+    # 20 mm over sqrt(1500) points a direction is 0.5 mm
+    assert_allclose(found.p[1:], p[1:], atol=4e-3)
+    assert_allclose(found.R, R, atol=2e-3)
+    assert found.overlap > 0.95
+    S = whitening(found.information, 1.0)
+    assert np.linalg.svd(S)[1][-1] < 1e-12 * np.linalg.svd(S)[1][0]
+
+
+def test_an_end_wall_tells_the_way_along():
+    rng = np.random.default_rng(5)
+
+    def closed(count):
+        points = tube(rng, count, 0.02, 9.7)
+        points[: count // 8] = np.column_stack(
+            [
+                9.7 + 0.02 * rng.standard_normal(count // 8),
+                rng.uniform(-1.9, 1.9, count // 8),
+                rng.uniform(-1.4, 1.4, count // 8),
+            ]
+        )
+        return points
+
+    planes = SurfelMap(0.5)
+    planes.add(closed(60_000))
+    prior = (np.eye(3), np.zeros(3))
+    found = registration.align(closed(3000) - [0.1, 0.0, 0.0], prior, prior, planes)
+    assert found.weak.shape[1] == 0
+    assert_allclose(found.p, [0.1, 0.0, 0.0], atol=5e-3)
+
+
+# ---- what is no scan ----
+
+
+def test_bad_scans_are_survived():
+    odometry = Odometry(SENSOR, Blind())
+    rng = np.random.default_rng(6)
+    good = tube(rng, 4000, 0.02, 8.0)
+
+    def scan(points, after_s=None):
+        return clouds.Scan(0, points, after_s, 0, 0, 0)
+
+    assert odometry.register(scan(np.zeros((0, 3))), 0.0) is None
+    assert odometry.register(scan(good[:20]), 0.1) is None
+    assert odometry.register(scan(good), 0.2).healthy
+    assert odometry.register(scan(good), 0.2) is None  # the same again
+    assert odometry.register(scan(np.tile(good[:1], (500, 1))), 0.3) is not None
+    assert odometry.register(scan(good @ np.diag([1.0, -1.0, -1.0])), 0.4) is not None  # upside down
+    last = odometry.register(scan(good), 0.5)
+    assert last.healthy
+    assert np.isfinite(last.root).all()
+
+
+# ---- in the graph ----
+
+
+def test_steps_join_the_graph():
+    simulation = tunnel("smooth", 6.0)
+    problem = prepare(in_memory(simulation), simulation.rig)
+    result = estimate("batch", problem)
+    counts = result.counts["lidar"]
+    assert counts.received == counts.parts() == 60
+    assert counts.used > 50
+    truth = true_states(simulation, result.trajectory.t_ns)
+    errors = trajectory_errors(result.trajectory, truth)
+    # 6 dof; a draw of a chi-square of 6 beyond 30 has a chance of 4e-5
+    assert errors.nees[-1] < 30.0
+
+
+def test_scans_without_a_mounting_or_times_are_said():
+    simulation = tunnel("smooth", 5.0)
+    log = in_memory(simulation)
+
+    class Equal:
+        topic, frame_id = "/points", "lidar"
+        t_ns, counts = simulation.clouds[0].t_ns, simulation.clouds[0].counts
+
+        def __len__(self):
+            return len(self.t_ns)
+
+        def __iter__(self):
+            for t_ns, cloud in simulation.clouds[0]:
+                yield t_ns, cloud | {"time": np.zeros_like(cloud["time"])}
+
+    problem = prepare(replace(log, clouds={"/points": Equal()}), simulation.rig)
+    assert any("one time" in warning for warning in problem.warnings)
+    assert any(rows.sensor == "lidar" for rows in problem.rows)
