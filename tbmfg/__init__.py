@@ -25,4 +25,39 @@ Errors
     A quaternion's name holds its order (``quat_xyzw``). ``sigma`` and ``sd`` are standard deviations.
 """
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tbmfg.api import Comparison, compare, run
+    from tbmfg.errors import TbmfgError
+    from tbmfg.mcap import read_log
+    from tbmfg.rig import Rig, load_rig
+    from tbmfg.state import Result, Trajectory
+
 __version__ = "0.1.0"
+__all__ = ["Comparison", "Result", "Rig", "TbmfgError", "Trajectory", "compare", "load_rig", "read_log", "run"]
+
+_HOMES = {
+    "Comparison": "tbmfg.api",
+    "compare": "tbmfg.api",
+    "run": "tbmfg.api",
+    "TbmfgError": "tbmfg.errors",
+    "read_log": "tbmfg.mcap",
+    "Rig": "tbmfg.rig",
+    "load_rig": "tbmfg.rig",
+    "Result": "tbmfg.state",
+    "Trajectory": "tbmfg.state",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Names of the library, loaded when asked for: ``import tbmfg`` and ``tbmfg --help`` answer at once."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from tbmfg.errors import EstimationError, RigError, TbmfgError
 from tbmfg.fields import Node, near
+from tbmfg.registry import Registry
 from tbmfg.rig import Rig, kind_of, switches
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def _sbm(name: str, summary: str) -> Estimator:
     return Estimator(partial(sbm, name=name), summary, ("imu", "magnetometer"), "Wang et al. (2019)", model)
 
 
-ESTIMATORS: dict[str, Estimator] = {
+OWN: dict[str, Estimator] = {
     "batch": Estimator(
         batch,
         "smooths the whole log: Gauss-Newton over GTSAM's IMU factors and all sensors",
@@ -184,6 +185,7 @@ ESTIMATORS: dict[str, Estimator] = {
     "sbm-ekf": _sbm("sbm-ekf", "extended Kalman filter in Euler angles, with laser spot and barometer"),
     "sbm-cfekf": _sbm("sbm-cfekf", "the same, its rates corrected by the complementary filter"),
 }
+ESTIMATORS: Registry[Estimator] = Registry("tbmfg.estimators", OWN)
 
 
 def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], None] | None = None) -> Result:

@@ -124,7 +124,7 @@ class Session:
 
 
 def open_session(
-    log_path: str | Place,
+    log_path: str | Place | Log,
     *,
     rig: Rig | str | Path | None = None,
     truth: str = "auto",
@@ -134,13 +134,15 @@ def open_session(
     overrides: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Session:
-    """Read and prepare a log; the arguments are those of :func:`run`."""
+    """Read and prepare a log; the arguments are those of :func:`run_result`."""
     from tbmfg.estimators import check_switches
     from tbmfg.mcap import read_log
     from tbmfg.prepare import prepare
 
     started = time.perf_counter()
-    log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
+    log = log_path
+    if not isinstance(log, Log):
+        log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
     rig, assumed = rig_for(log, rig, overrides)
     check_switches(rig)
     dropped = dropped_sensors(rig, without, only)
@@ -152,11 +154,17 @@ def open_session(
         raise EstimationError("; ".join([str(error), *left_out])) from error
     options = {"outages": list(outages), "without": dropped, "set": list(overrides)}
     shared_s = time.perf_counter() - started
-    return Session(log, str(log_path), prepared, reference, tuple(assumed), options, shared_s)
+    path = log_path.path if isinstance(log_path, Log) else str(log_path)
+    return Session(log, path, prepared, reference, tuple(assumed), options, shared_s)
 
 
-def run(
-    log_path: str | Place,
+def run(log_path: str | Place | Log, **options: Any) -> dict[str, Any]:
+    """The summary of :func:`run_result` alone."""
+    return run_result(log_path, **options)[1]
+
+
+def run_result(
+    log_path: str | Place | Log,
     *,
     estimator: str = "batch",
     output: str | Place | None = None,
@@ -165,8 +173,8 @@ def run(
     force: bool = False,
     progress: Progress | None = None,
     **options: Any,
-) -> dict[str, Any]:
-    """Estimate one log and return its summary, the content of summary.json; with ``output`` write all files, with
+) -> tuple[Result, dict[str, Any]]:
+    """Estimate one log: the result and its summary, the content of summary.json. With ``output`` write all files, with
     ``report`` report.html among them, with ``into`` a copy of the log that holds the poses too.
 
     ``options``: ``rig``, a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
@@ -191,23 +199,25 @@ def run(
     if into is not None:
         from tbmfg.mcap import write_into
 
-        write_into(log_path, into, result.smoothed or result.trajectory, session.prepared.rig.sensors["imu"].topic)
-    return summary
+        write_into(session.log_path, into, result.smoothed or result.trajectory, session.prepared.rig.imu.topic)
+    return result, summary
 
 
 def compare(
-    log_path: str | Place,
+    log_path: str | Place | Log,
     *,
     estimators: Sequence[str],
     output: str | Place | None = None,
     force: bool = False,
     progress: Progress | None = None,
+    each: Callable[[str, Result], object] | None = None,
     **options: Any,
 ) -> dict[str, dict[str, Any]]:
     """Run several estimators on one prepared log: {estimator: summary}, or {"not_run": why} for one that could not.
 
-    With ``output`` every estimator's files go to a folder of its name, compare.json and report.html beside them. The
-    other arguments are those of :func:`run`. Raises TbmfgError when none ran.
+    With ``output`` every estimator's files go to a folder of its name, compare.json and report.html beside them.
+    ``each`` is called with every estimator's name and result. The other arguments are those of :func:`run_result`.
+    Raises TbmfgError when none ran.
     """
     from tbmfg.estimators import unmet
 
@@ -228,6 +238,8 @@ def compare(
                 result, summaries[name] = session.estimate(name, progress)
             except EstimationError as error:
                 reason = str(error)
+        if reason is None and each is not None:
+            each(name, result)
         if reason is not None:
             summaries[name] = report.summaries[name] = {"not_run": reason}
         elif output is not None:
@@ -235,7 +247,8 @@ def compare(
             rig = dump_rig(session.prepared.rig)
             write_result(output / name, result, summaries[name], rig, force=force)
     if all("not_run" in summary for summary in summaries.values()):
-        raise TbmfgError(f"{log_path}: none ran: " + "; ".join(f"{k}: {v['not_run']}" for k, v in summaries.items()))
+        reasons = "; ".join(f"{name}: {summary['not_run']}" for name, summary in summaries.items())
+        raise TbmfgError(f"{session.log_path}: none ran: {reasons}")
     if output is not None:
         write_text(output / REPORT, report.html(), force=force)
         write_text(output / COMPARISON, to_json(summaries), force=force)

@@ -46,6 +46,7 @@ from tbmfg.fields import (
     or_raise,
     si,
 )
+from tbmfg.registry import Registry
 from tbmfg.timeseries import Floats
 from tbmfg.yamltext import KeyPath, dotted
 
@@ -188,7 +189,11 @@ class Imu(Sensor):
 
 
 class PositionSensor(Sensor):
-    """A sensor of the position of one point of the machine."""
+    """A sensor of the position of one point of the machine in n.
+
+    A kind of one's own is a subclass with ``sigma_at(position_n)``: standard deviations [m] of fixes at (n, 3) m, (n,)
+    or (n, 3) per axis.
+    """
 
     arm_m: Triple = Field(ZERO, description="Lever arm: from the IMU to the point, in b.")
     arm_sd_m: CalibrationSd = Field(0.0, description="Per axis; 0 or null: the arm is not estimated.")
@@ -331,7 +336,7 @@ class Lidar(Sensor):
     voxel = si("voxel_m")
 
 
-KINDS: dict[str, type[Sensor]] = {
+OWN_KINDS: dict[str, type[Sensor]] = {
     "imu": Imu,
     "prism": Prism,
     "gnss": Gnss,
@@ -341,6 +346,7 @@ KINDS: dict[str, type[Sensor]] = {
     "laser": Laser,
     "lidar": Lidar,
 }
+KINDS: Registry[type[Sensor]] = Registry("tbmfg.sensors", OWN_KINDS)
 
 
 def kind_of(name: str) -> str:

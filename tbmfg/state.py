@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -103,7 +104,7 @@ class Result:
     """What every estimator returns.
 
     ``trajectory`` is the plain (for online solvers: causal) one; ``smoothed`` the last estimates,
-    where they differ.
+    where they differ. ``summary`` is the content of summary.json, once there is one.
     """
 
     estimator: str
@@ -114,3 +115,4 @@ class Result:
     innovations: dict[str, Innovations] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)

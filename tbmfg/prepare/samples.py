@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from tbmfg.mcap.clouds import TYPE as CLOUDS
 from tbmfg.mcap.info import guess_role
 from tbmfg.measure import Samples
 from tbmfg.prepare import health
-from tbmfg.rig import PositionSensor, Prism, Rig, Sensor, kind_of
+from tbmfg.rig import Gnss, PositionSensor, Rig, Sensor, kind_of
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats, Log, Series, seconds
 
@@ -107,7 +108,8 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
         counts[name] = count = Counts(received=c.received, duplicate=c.duplicate, nonfinite=c.nonfinite)
         if kind == "lidar" and name not in without:
             continue  # not columns, but scans to be registered: ``scans``
-        if name in without or kind not in VALUES:
+        read = readings(kind, sensor)
+        if name in without or read is None:
             if name not in without:
                 warnings.append(
                     f"{name}: no model for this kind of sensor yet; its {len(series)} messages are not used"
@@ -130,10 +132,10 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
             count.unused += int(keep.sum())
             continue
         try:
-            values = np.ascontiguousarray(VALUES[kind](series))
+            values = np.ascontiguousarray(read(series))
         except KeyError:
             raise LogError(f"{log.path}: {name}: {sensor.topic} is {series.type}, {instead(log, kind)}") from None
-        found = Samples(name, t, values, sigma_of(sensor, series)).select(keep)
+        found = Samples(name, t, values, sigma_of(sensor, series, values)).select(keep)
         sound, said = health.check(sensor, found)
         warnings += [f"{name}: {line}" for line in said]
         if sound.sum() >= 2:
@@ -181,8 +183,20 @@ def instead(log: Log, kind: str) -> str:
     return f"{kind} topics in the log: {', '.join(alike) or 'none'}"
 
 
-def sigma_of(sensor: Sensor, series: Series) -> Floats | None:
-    """Standard deviation per axis of n of positions [m], (n, 3): the fix's own, or a total station's at that range."""
-    if isinstance(sensor, Prism):
-        return np.repeat(sensor.sigma_at(series["point"])[:, None], 3, axis=1)
-    return series["sigma"] if isinstance(sensor, PositionSensor) else None
+def readings(kind: str, sensor: Sensor) -> Callable[[Series], Floats] | None:
+    """What a sensor measures with, from its series; None for a kind without a model."""
+    return VALUES.get(kind, position if isinstance(sensor, PositionSensor) else None)
+
+
+def position(series: Series) -> Floats:
+    """(n, 3) m, of a message with a point or a pose."""
+    return series["point" if "point" in series.columns else "position"]
+
+
+def sigma_of(sensor: Sensor, series: Series, values: Floats) -> Floats | None:
+    """Standard deviation per axis of n of positions [m], (n, 3): the fix's own, or the sensor's there."""
+    if not isinstance(sensor, PositionSensor):
+        return None
+    if isinstance(sensor, Gnss):
+        return series["sigma"]
+    return np.tile(np.reshape(sensor.sigma_at(values), (len(values), -1)), (1, 3))[:, :3]
