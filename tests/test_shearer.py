@@ -6,9 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import chi2
 
+import datasets
 from tbmfg.errors import EstimationError
 from tbmfg.estimators import estimate, unmet
+from tbmfg.evaluation.metrics import nees
 from tbmfg.filters import shearer
 from tbmfg.filters.shearer import DESIGNS, Adaptive, Federated, Magnetic
 from tbmfg.prepare import prepare
@@ -98,6 +101,60 @@ def test_perfect_sensors_and_a_true_prior_give_the_truth(name):
     assert np.abs(error / sd).max() < 0.1
     # the mean over a period is the speed at its middle, but for the IMU edge that stands for it: 2.5 ms of 0.1 m/s^2
     assert max(np.nanmax(nis) for nis in found.nis.values()) < 0.05
+
+
+SEEDS = range(200, 206)
+EPOCHS_S = (8.0, 24.0, 38.0)  # on the way, standing where the cut ends, on the way back
+CELLS = [(name, epoch, size) for name in ("shearer-sins-od", "shearer-ckf") for epoch in EPOCHS_S for size in (6, 15)]
+
+
+@pytest.mark.slow
+def test_normalised_errors_are_chi_square_there_and_back():
+    """A short face: the machine cuts it, stands, and goes back without turning round, so with a negative speed."""
+    values = {cell: [] for cell in CELLS}
+    for seed in SEEDS:
+        simulation = datasets.make("shearer-panel", seed=seed, duration=40.0, face_m=20.0, bend_m=8.0, web_m=0.4)
+        cut = prepare(log_of(simulation.log_series), simulation.rig)
+        assert cut.samples["odometer"].values.min() < -0.8
+        truth = true_states(simulation, cut)
+        found = {name: run(name, cut) for name in dict.fromkeys(name for name, _, _ in CELLS)}
+        for name, epoch, size in CELLS:
+            k = int(np.argmin(np.abs(cut.keyframes_s - epoch)))
+            error = state_errors(found[name].x[k : k + 1], truth[k : k + 1])[:, :size]
+            values[name, epoch, size] += nees(error, found[name].cov[k : k + 1, :size, :size]).tolist()
+    alpha = 0.01 / len(CELLS)  # the risk of one false alarm is shared by all
+    faults = []
+    for (name, epoch, size), squares in values.items():
+        low, high = chi2.ppf([alpha / 2, 1 - alpha / 2], size * len(SEEDS)) / size / len(SEEDS)
+        mean = np.mean(squares) / size
+        if not low < mean < high:
+            faults.append(f"{name}, {size} states at {epoch:g} s: {mean:.2f} outside {low:.2f}..{high:.2f}")
+    assert not faults, "; ".join(faults)
+
+
+@pytest.mark.parametrize("name", ["shearer-ckf-ar", "shearer-afkf"])
+def test_a_magnetic_fault_is_weighed_down(name):
+    """A field that turns by 20 degrees from 10 to 30 s: the fixed noise follows it, the adaptive one does not."""
+    simulation = datasets.make("shearer-magfault", seed=0, duration=32.0, fault="offset")
+    cut = prepare(log_of(simulation.log_series), simulation.rig)
+    truth = true_states(simulation, cut)
+    up_b = truth[:, 6:9]
+
+    def yaw_error(found):
+        return np.degrees(np.abs(np.sum(up_b * state_errors(found.x, truth)[:, :3], axis=1)).max())
+
+    adaptive = run(name, cut, DESIGNS[name].switches())
+    assert yaw_error(run("shearer-ckf", cut)) > 15
+    assert yaw_error(adaptive) < 4
+    t = view_times(cut, "magnetometer")
+    assert adaptive.noise["magnetometer"][(t > 13) & (t < 28)].min() > 3
+    assert adaptive.noise["magnetometer"][t < 9].max() < 2.5
+
+
+def view_times(problem, sensor):
+    """Seconds of one sensor's rows as the filters see them."""
+    [rows] = [rows for rows in shearer.view(problem, DESIGNS["shearer-ckf"]).rows if rows.sensor == sensor]
+    return problem.inertial.steps.edges_s[rows.i]
 
 
 def test_magnetic_yaw_alone_hides_the_tilt():
