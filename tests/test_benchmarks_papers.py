@@ -12,6 +12,7 @@ from benchmarks.papers.trials import Method, Outcome, Outcomes, confidence
 from benchmarks.rows import read_rows
 from tbmfg.evaluation.metrics import chi_square_bounds
 from tbmfg.state import Innovations, Interval
+from tests.test_datasets_sensors import assert_chi_square
 
 ERRORS = {"plain": [10.0, 12.0, 8.0, 11.0], "better": [4.0, 5.0, 3.5, 5.5], "best": [2.0, 2.5, 1.5, 2.0]}
 
@@ -78,6 +79,28 @@ def test_failed_logs_are_counted_and_left_out(ladder):
     assert outcomes.paired("cut", "better", "plain", "max")[0].n == 4
 
 
+def test_errors_over_their_bound():
+    runs = [
+        Outcome("nominal", "batch", seed, {"rms_horizontal": (rms, "m"), "sd_horizontal": (0.5, "m")})
+        for seed, rms in enumerate([0.3, 0.4, 0.5])
+    ]
+    ratio, low, high = shearer.over_bound(Outcomes(runs), "nominal", "batch")
+    assert ratio.mean == pytest.approx(np.sqrt((0.36 + 0.64 + 1.0) / 3))
+    assert low.mean < ratio.mean < high.mean
+    assert low.inside
+    assert shearer.over_bound(Outcomes(runs[:1]), "nominal", "batch") == []
+
+
+def test_surveyed_end_is_the_end_within_its_sd():
+    errors = []
+    for seed in range(30):
+        simulation = datasets.make("shearer-cut", seed=seed, duration=2.0)
+        [point] = shearer.surveyed_end(simulation, seed).survey
+        assert point.at == "end"
+        errors.append((np.array(point.position_m) - simulation.truth(np.array([2.0])).position[0]) / point.sigma_m)
+    assert_chi_square(np.array(errors))
+
+
 # ---- magnetic faults ----
 
 
@@ -137,7 +160,15 @@ def test_shearer_paper_runs(tmp_path, monkeypatch, capsys):
         == 0
     )
     rows = {row.key: row for row in read_rows(out)}
-    assert {key[0] for key in rows} == {"nominal", "aligned", "mti30=printed", "offset", "field", "spikes"}
+    assert {key[0] for key in rows} == {
+        "nominal",
+        "surveyed end",
+        "aligned",
+        "mti30=printed",
+        "offset",
+        "field",
+        "spikes",
+    }
     assert all(row.mean == 0 for row in rows.values() if row.metric == "failed")
     assert rows["nominal", "shearer-sins", "max_east"].published == 3.9664
     assert rows["nominal", "shearer-ckf", "max_north less than shearer-sins-od"].published == 74.01

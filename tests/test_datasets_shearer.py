@@ -8,7 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import datasets
 from datasets import shearer
+from datasets.__main__ import main
 from tbmfg.errors import TbmfgError
+from tbmfg.mcap import read_log
 from tbmfg.rig import load_rig
 from tests.test_datasets_sensors import assert_chi_square, log_of, seconds_of
 
@@ -78,6 +80,31 @@ def test_longer_log_begins_with_the_shorter_one():
         else:
             for name, column in one.columns.items():
                 assert_allclose(other[name][: len(one)], column, atol=1e-6)
+
+
+def test_face_lies_on_the_earth_not_in_the_frame():
+    turned = cut(duration=5.0, slide=0.0, settings=("origin.x_axis_azimuth_deg=25",))
+    ahead = turned.truth(np.array([4.0])).velocity[0]
+    east = ahead[0] * np.sin(np.radians(25)) - ahead[1] * np.cos(np.radians(25))
+    north = ahead[0] * np.cos(np.radians(25)) + ahead[1] * np.sin(np.radians(25))
+    assert_allclose([east, north], AHEAD, atol=1e-5)
+
+
+def test_same_seed_same_log():
+    first, again, other = (datasets.make("shearer-magfault", seed=seed, duration=12.0) for seed in (3, 3, 4))
+    assert first.rig_text == again.rig_text != other.rig_text
+    for one, two, three in zip(first.log_series, again.log_series, other.log_series, strict=True):
+        assert all(np.array_equal(column, two[name]) for name, column in one.columns.items())
+        assert any(not np.array_equal(column, three[name]) for name, column in one.columns.items())
+
+
+def test_made_on_the_command_line(tmp_path, capsys):
+    path = tmp_path / "fault.mcap"
+    assert main(["make", "shearer-magfault", "-o", str(path), "--duration", "13", "--set", "fault=spikes"]) == 0
+    assert "/odometer 130, /imu/mag 131" in capsys.readouterr().out
+    read, simulated = read_log(path), cut("shearer-magfault", seed=0, duration=13.0, fault="spikes")
+    assert_array_equal(read.series["/imu/mag"]["field"], log_of(simulated, "/imu/mag")["field"])
+    assert len(simulated.drawn["magnetometer"]["spikes"]) > 0
 
 
 # ---- sensors ----

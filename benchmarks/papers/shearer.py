@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.papers import Plan
-from benchmarks.papers.trials import Method, Metrics, Outcomes, Trial
+from benchmarks.papers.trials import Method, Metrics, Outcomes, Trial, confidence
 from benchmarks.rows import Row
 
 if TYPE_CHECKING:
     from datasets.simulate import Simulation
+    from tbmfg.rig import Rig
     from tbmfg.state import Result, Truth
 
 SINS, OD, MAG, AR, AFKF = "shearer-sins", "shearer-sins-od", "shearer-ckf", "shearer-ckf-ar", "shearer-afkf"
@@ -69,6 +70,7 @@ MAGNETIC_TEST = {
 }  # fmt: skip
 MAGNETIC_REDUCTION = 59.6
 
+SURVEY_SD_M = 0.01
 REPORTED_S = 1.0  # magnetometer intervals closer than this are one stretch
 CLEAR = 5.0  # sds from which a spike has to be found
 BOUNDS = {"fault_start": (None, 1.0), "fault_end": (None, 1.0), "spikes_found": (95.0, None)}
@@ -94,6 +96,7 @@ def trials(seed: int, duration_s: float | None) -> list[Trial]:
     ]
     return [
         cut("nominal", methods=ALL),
+        cut("surveyed end", methods=(Method("batch", "batch"),), rig=surveyed_end),
         *scales,
         cut("aligned", methods=FEW, settings=ALIGNED),
         cut("mti30=printed", methods=FEW, options={"mti30": "printed"}),
@@ -110,7 +113,31 @@ def ladder(outcomes: Outcomes) -> list[Row]:
             rows.append(outcomes.reduction(scenario, method, other, metric, published))
         rows += [outcomes.ordering(scenario, LADDER, metric) for metric in ("max_east", "max_north")]
         rows += against_batch(outcomes, scenario, ("rms_horizontal", "end_horizontal"))
-    return rows
+    return [*rows, *over_bound(outcomes, "nominal", "batch"), *survey(outcomes)]
+
+
+def survey(outcomes: Outcomes) -> list[Row]:
+    """What a surveyed end of the way is worth to the smoother: the nominal logs without it, and with it."""
+    without, with_it = (outcomes.mean(name, "batch", "rms_horizontal") for name in ("nominal", "surveyed end"))
+    n = len(outcomes.by_seed("surveyed end", "batch", "rms_horizontal"))
+    gain = Row("surveyed end", "batch", "rms_horizontal without / with", "", without / with_it, None, n, (3.0, None))
+    return [*outcomes.rows("surveyed end", {}, {}), gain]
+
+
+def over_bound(outcomes: Outcomes, scenario: str, method: str) -> list[Row]:
+    """Squared error over the variance that the covariance gives it, which in a smoother of all that was measured is the
+    Cramer-Rao bound but for where it was linearised: as a ratio of standard deviations with its confidence interval."""
+    rms, sd = (outcomes.by_seed(scenario, method, name) for name in ("rms_horizontal", "sd_horizontal"))
+    if len(rms) < 2:
+        return []
+    squared = np.array([(rms[seed] / sd[seed]) ** 2 for seed in rms])
+    low, high = np.sqrt(np.maximum(confidence(squared), 0.0))
+    name = "rms_horizontal / sd_horizontal"
+    return [
+        Row(scenario, method, name, "", float(np.sqrt(squared.mean())), None, len(rms)),
+        Row(scenario, method, f"{name}, low", "", float(low), None, len(rms), (None, 1.05)),
+        Row(scenario, method, f"{name}, high", "", float(high), None, len(rms)),
+    ]
 
 
 def magnetic(outcomes: Outcomes) -> list[Row]:
@@ -139,6 +166,17 @@ def adaptive_share(outcomes: Outcomes, scenario: str) -> Row:
     return Row(scenario, AR, "adaptive share", "%", 100.0 * (fixed - adaptive) / (fixed - federated), None, n)
 
 
+def surveyed_end(simulation: Simulation, seed: int) -> Rig:
+    """The log's rig and where the way ended, to a centimetre per axis."""
+    from datasets.simulate import stream
+    from tbmfg.rig import override
+
+    end_s = (simulation.clean["imu"].t_ns[-1] - simulation.start_ns) * 1e-9
+    position = simulation.truth(np.array([end_s])).position[0] + SURVEY_SD_M * stream(seed, "survey").standard_normal(3)
+    point = f"{{at: end, position_m: {position.tolist()}, sigma_m: {SURVEY_SD_M}}}"
+    return override(simulation.rig, [f"survey=[{point}]"])
+
+
 def errors(simulation: Simulation, result: Result, truth: Truth) -> Metrics:
     """Along east and north, m, and of the heading, deg, at the keyframes; n's x axis lies where the rig says."""
     from tbmfg.evaluation.metrics import trajectory_errors
@@ -150,6 +188,7 @@ def errors(simulation: Simulation, result: Result, truth: Truth) -> Metrics:
     east, north = x * np.sin(azimuth) - y * np.cos(azimuth), x * np.cos(azimuth) + y * np.sin(azimuth)
     horizontal = np.hypot(east, north)
     yaw_deg = np.degrees(split_yaw_tilt(found.rotation_n)[0])
+    said = np.einsum("kii->k", result.trajectory.cov[found.rows, 3:5, 3:5])
     return {
         "max_east": (float(np.abs(east).max()), "m"),
         "max_north": (float(np.abs(north).max()), "m"),
@@ -158,6 +197,7 @@ def errors(simulation: Simulation, result: Result, truth: Truth) -> Metrics:
         "end_north": (float(abs(north[-1])), "m"),
         "end_horizontal": (float(horizontal[-1]), "m"),
         "rms_horizontal": (float(np.sqrt(np.mean(horizontal**2))), "m"),
+        "sd_horizontal": (float(np.sqrt(np.mean(said))), "m"),
         "max_yaw": (float(np.abs(yaw_deg).max()), "deg"),
         "rms_yaw": (float(np.sqrt(np.mean(yaw_deg**2))), "deg"),
     }

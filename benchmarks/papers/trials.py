@@ -40,8 +40,8 @@ class Method:
 class Trial:
     """One log to simulate, ``settings`` and ``options`` as :func:`datasets.make` takes them, and who estimates it.
 
-    ``metrics`` measures a result against the truth at its keyframes; ``rig`` says what the estimators are told, where
-    that is not just the log's own rig. Both are functions of a module, so that another process finds them.
+    ``metrics`` measures a result against the truth at its keyframes; ``rig`` says with the seed what the estimators are
+    told, where that is not just the log's own rig. Both are functions of a module, so that another process finds them.
     """
 
     scenario: str
@@ -52,7 +52,7 @@ class Trial:
     metrics: Callable[[Simulation, Result, Truth], Metrics]
     settings: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
-    rig: Callable[[Simulation], Rig] | None = None
+    rig: Callable[[Simulation, int], Rig] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def run(trial: Trial) -> list[Outcome]:
     simulation = datasets.make(
         trial.dataset, seed=trial.seed, duration=duration_s, settings=trial.settings, **trial.options
     )
-    rig = simulation.rig if trial.rig is None else trial.rig(simulation)
+    rig = simulation.rig if trial.rig is None else trial.rig(simulation, trial.seed)
     outcomes, problem = [], None
     for method in trial.methods:
         if trial.seed % method.every:
