@@ -269,6 +269,7 @@ class Odometer(Sensor):
 class Magnetometer(Sensor):
     """Direction of the horizontal magnetic field. The default sd is for a calibrated unit beside steel."""
 
+    unit: Literal["T", "G", "uT", "nT"] = Field("T", description="Unit of the messages; ROS has T.")
     sigma_deg: Positive = Field(2.0, description="Of the horizontal direction, per sample.")
     declination_deg: Number = Field(0.0, description="Magnetic north from true north, east positive.")
     declination_sd_deg: CalibrationSd = Field(0.0, description="0 or null: the declination is not estimated.")
@@ -292,6 +293,7 @@ class Magnetometer(Sensor):
 class Barometer(Sensor):
     """Height from air pressure, with a wandering bias. Defaults: a MEMS barometer in ventilated air."""
 
+    unit: Literal["Pa", "hPa", "kPa"] = Field("Pa", description="Unit of the messages; ROS has Pa.")
     sigma_m: Positive = Field(0.2, description="White noise of the height, per sample.")
     bias_sd_m: CalibrationSd = Field(10.0, description="Of the bias at the start; 0 or null: not estimated.")
     bias_walk: NotNegative = Field(0.01, description="Random walk of the bias, m/sqrt(s).")
@@ -307,10 +309,15 @@ class Barometer(Sensor):
 class Laser(Sensor):
     """Spot of a plumb laser on the machine's detector, in the detector's own x and y."""
 
+    unit: Literal["m", "mm"] = Field("m", description="Unit of the messages; ROS has m.")
     sigma_mm: Positive = Field(0.2, description="Of the spot, per axis.")
+    half_width_mm: Positive | None = Field(
+        None, description="Of the detector: a spot at its edge or beyond is left out; null: not checked."
+    )
     T_bd: Mounting = Field(Mounting(), description="The detector in b.")
 
     sigma = si("sigma_mm", MM)
+    half_width = si("half_width_mm", MM)
 
 
 class Lidar(Sensor):

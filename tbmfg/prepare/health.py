@@ -1,4 +1,5 @@
-"""What odometers and magnetometers say against their own health: before estimating, and so for every estimator alike.
+"""What odometers, magnetometers, barometers and lasers say against their own health: before estimating, and so for
+every estimator alike.
 
 Each check returns which samples are sound, (n,) bool, and a line for every fault that it has found.
 """
@@ -9,15 +10,17 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from tbmfg.fields import MICRO_TESLA, STANDARD_GRAVITY
+from tbmfg.fields import MICRO_TESLA, MM, STANDARD_GRAVITY
 from tbmfg.measure import Samples
-from tbmfg.rig import Magnetometer, Odometer, Sensor
+from tbmfg.rig import Barometer, Laser, Magnetometer, Odometer, Sensor
 from tbmfg.timeseries import Floats
 
 FASTEST = 5 * STANDARD_GRAVITY  # m/s^2: no machine's speed changes faster; an encoder's that rolls over does
 NOISE = 10.0  # sds of an odometer's noise that are no jump either
 STUCK = 10  # readings in a row that are equal to the last digit
 PILE = 3  # times as many readings at the end of the scale as at the next value inside: noise thins out, limits do not
+HUNG_S = 2.0  # for longer than this no spot stays the same to the last digit
+EDGE = 1e-3  # of the detector's half width: a spot that near its edge, or beyond, is not on it
 LEVELS = 10  # different readings from which an axis shows how noise thins out
 
 Sound = tuple[NDArray[np.bool_], list[str]]
@@ -29,6 +32,10 @@ def check(sensor: Sensor, samples: Samples) -> Sound:
         return odometer(samples.t_s, samples.values, sensor.sigma)
     if isinstance(sensor, Magnetometer):
         return magnetometer(samples.t_s, samples.values)
+    if isinstance(sensor, Barometer):
+        return barometer(samples.values)
+    if isinstance(sensor, Laser):
+        return laser(samples.t_s, samples.values, sensor.half_width)
     return np.ones(len(samples.t_s), dtype=bool), []
 
 
@@ -88,6 +95,36 @@ def magnetometer(t_s: Floats, field: Floats) -> Sound:
                     f"of {len(field)} samples, the first at {t_s[np.argmax(limit)]:.1f} s; left out"
                 )
     return sound, said
+
+
+def barometer(height: Floats) -> Sound:
+    """Leaves out all heights (n,) where they are one: a barometer that is read faster than it converts repeats some."""
+    if len(height) < STUCK or np.ptp(height) > 0:
+        return np.ones(len(height), dtype=bool), []
+    return np.zeros(len(height), dtype=bool), [
+        f"all {len(height)} samples are the same, {height[0]:.2f} m in the standard atmosphere: it is stuck; left out"
+    ]
+
+
+def laser(t_s: Floats, spot: Floats, half_width: float | None) -> Sound:
+    """Leaves out spots (n, 2) m beside the detector, and those after the first of a spot that hangs."""
+    said, beside, hung = [], np.zeros(len(spot), dtype=bool), np.zeros(len(spot), dtype=bool)
+    if half_width is not None:
+        beside = (np.abs(spot) >= (1 - EDGE) * half_width).any(axis=1)
+    if beside.any():
+        said.append(
+            f"the spot is at the detector's edge ({half_width / MM:g} mm) or beyond in {beside.sum()} of {len(spot)} "
+            f"samples, the first at {t_s[np.argmax(beside)]:.1f} s; left out"
+        )
+    for first, last in _runs(np.concatenate([[False], (np.diff(spot, axis=0) == 0).all(axis=1)])):
+        hung[first:last] = last - first >= STUCK and t_s[last - 1] - t_s[first - 1] > HUNG_S
+    hung &= ~beside
+    if hung.any():
+        said.append(
+            f"the spot hangs: {hung.sum()} of {len(spot)} samples repeat the one before for over {HUNG_S:g} s on end, "
+            f"the first at {t_s[np.argmax(hung)]:.1f} s; left out"
+        )
+    return ~(beside | hung), said
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -13,7 +13,7 @@ from tbmfg.inertial.steps import Steps, make_steps
 from tbmfg.mcap.clouds import TYPE as CLOUDS
 from tbmfg.mcap.info import guess_role
 from tbmfg.measure import Samples
-from tbmfg.prepare import health
+from tbmfg.prepare import health, units
 from tbmfg.rig import Gnss, PositionSensor, Rig, Sensor, kind_of
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats, Log, Series, seconds
@@ -53,8 +53,8 @@ def imu_steps(
     if "gyro" not in series.columns:
         raise LogError(f"{log.path}: imu: {topic} is {series.type}, {instead(log, 'imu')}; set sensors.imu.topic")
     c = series.counts
-    units = {"gyro": rig.imu.gyro_scale, "acc": rig.imu.acc_scale}
-    series = replace(series, columns={column: scale * series[column] for column, scale in units.items()})
+    scales = {"gyro": rig.imu.gyro_scale, "acc": rig.imu.acc_scale}
+    series = replace(series, columns={column: scale * series[column] for column, scale in scales.items()})
     if (wrong := sanity.impossible(series)).any():
         limits = " rad/s or ".join(f"{limit:g}" for limit in sanity.POSSIBLE.values())
         warnings.append(f"imu: {wrong.sum()} of {len(series)} samples are beyond {limits} m/s^2; left out")
@@ -132,7 +132,7 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
             count.unused += int(keep.sum())
             continue
         try:
-            values = np.ascontiguousarray(read(series))
+            values = np.ascontiguousarray(read(units.in_si(log.path, name, sensor, series)))
         except KeyError:
             raise LogError(f"{log.path}: {name}: {sensor.topic} is {series.type}, {instead(log, kind)}") from None
         found = Samples(name, t, values, sigma_of(sensor, series, values)).select(keep)
