@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import binary_closing, median_filter
 
 from tbmfg.problem import Problem
+from tbmfg.rig import kind_of
 from tbmfg.state import ROT, Innovations, Interval, Trajectory
 from tbmfg.timeseries import Floats
 
 UNOBSERVED = 0.9  # posterior over prior sd from which a calibration counts as not observed
 VAGUE_HEADING = np.deg2rad(10.0)
+BIASED = 3.0  # sds to one side from which a sensor is called biased
+MEDIAN_ROWS = 9  # of the running median that judges it
 STRETCH = 3  # gated rows in a row from which a stretch of them is worth naming
 
 
@@ -73,6 +77,36 @@ def gated_stretches(innovations: dict[str, Innovations]) -> list[Interval]:
             if last - first + 1 >= STRETCH:
                 found.append(Interval(sensor, "gated", int(series.t_ns[first]), int(series.t_ns[last])))
     return found
+
+
+def biased_stretches(problem: Problem, x: Floats, c: Floats) -> list[tuple[Interval, float]]:
+    """Times in which a sensor of one number lay BIASED sds or more to one side of the estimate at the keyframe states
+    ``x`` (n, 21 + e) and calibrations ``c``, and by how much in its unit: the running median says so, which
+    neither noise (0.4 sd) nor single spikes move."""
+    found = []
+    for rows in problem.rows:
+        if rows.dof > 1 or len(rows) < MEDIAN_ROWS:
+            continue
+        residual = rows.evaluate(x, c)[0][:, 0]
+        median = median_filter(residual, MEDIAN_ROWS, mode="nearest")
+        t_ns = problem.t_ns[rows.j]
+        for sign in (1.0, -1.0):
+            far = binary_closing(np.pad(sign * median > BIASED, MEDIAN_ROWS), np.ones(MEDIAN_ROWS))
+            edges = np.flatnonzero(np.diff(far[MEDIAN_ROWS - 1 : 1 - MEDIAN_ROWS].astype(int)))
+            for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
+                size = float(np.median((residual * rows.sigma[:, 0])[first : last + 1]))
+                found.append((Interval(rows.sensor, "biased", int(t_ns[first]), int(t_ns[last])), size))
+    return sorted(found, key=lambda one: one[0].start_ns)
+
+
+def biased_in_words(biased: list[tuple[Interval, float]], origin_ns: int) -> list[str]:
+    """One line per stretch."""
+    lines = []
+    for stretch, size in biased:
+        start, end = (stretch.start_ns - origin_ns) * 1e-9, (stretch.end_ns - origin_ns) * 1e-9
+        by = f"{np.rad2deg(size):+.1f} deg" if kind_of(stretch.sensor) == "magnetometer" else f"{size:+.2g} m"
+        lines.append(f"{stretch.sensor}: biased by {by} from {start:.1f} to {end:.1f} s against all else")
+    return lines
 
 
 def gated_in_words(stretches: list[Interval], origin_ns: int) -> list[str]:

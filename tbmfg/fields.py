@@ -53,7 +53,7 @@ Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
 NoiseFactor = Annotated[float | Literal["auto"], PlainValidator(_noise_factor)]
 Moment = Annotated[float | Literal["start", "end"], PlainValidator(_moment)]
-Loss = Literal["none", "huber", "cauchy"]
+Loss = Literal["none", "huber", "cauchy", "gnc"]
 
 ZERO = (0.0, 0.0, 0.0)
 

@@ -47,6 +47,7 @@ def result(
     """
     path = trajectory(problem, x, cov)
     sd = np.sqrt(np.maximum(np.diag(c_cov), 0.0))
+    biased = diagnosis.biased_stretches(problem, x, c) if row_times_ns is None else []
     row_times_ns = path.t_ns if row_times_ns is None else row_times_ns
     innovations = {
         rows.sensor: Innovations(row_times_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
@@ -59,11 +60,12 @@ def result(
         calibration={**calibrations(problem, c, sd), **_drifts(problem, x, cov)},
         counts=_counts(problem, gated),
         innovations=innovations,
-        intervals=[*problem.intervals, *stretches],
+        intervals=[*problem.intervals, *stretches, *(stretch for stretch, _ in biased)],
         warnings=[
             *diagnosis.unobserved(problem, path, sd),
             *diagnosis.vague_heading(path),
             *diagnosis.gated_in_words(stretches, problem.t0_ns),
+            *diagnosis.biased_in_words(biased, problem.t0_ns),
         ],
     )
 

@@ -15,7 +15,7 @@ from tbmfg.filters import ins
 from tbmfg.inertial.strapdown import correct_states, propagate
 from tbmfg.problem import GATE
 from tbmfg.sensors import Rows
-from tbmfg.smoother import batch, graph
+from tbmfg.smoother import batch, graph, losses
 from tests.problems import ERRORS, flight_problem, state_errors, worst
 
 LOSSES = ("none", "huber", "cauchy")
@@ -45,24 +45,42 @@ def sds(cov):
 @pytest.mark.parametrize("dof", [1, 3, 6])
 def test_weight_is_the_slope_of_the_cost(loss, dof):
     """rho(s) of the normalised residual s: the weight is rho'(s) / s = 2 d rho / d s^2."""
-    k2 = graph.threshold(dof) ** 2
+    k2 = losses.threshold(dof) ** 2
     for nis in (1e-6, 0.3 * k2, 0.999 * k2, 1.001 * k2, 3 * k2, 500 * k2):
         h = 1e-5 * nis
-        slope = (graph.loss_cost(np.array([nis + h]), loss, dof) - graph.loss_cost(np.array([nis - h]), loss, dof)) / h
-        found = graph.weight(np.array([nis]), loss, dof)[0]
+        slope = (losses.cost(np.array([nis + h]), loss, dof) - losses.cost(np.array([nis - h]), loss, dof)) / h
+        found = losses.weight(np.array([nis]), loss, dof)[0]
         # truncation h^2 rho''' / 3 is below 1e-9 of it, rounding eps rho / h
         assert found == pytest.approx(slope, rel=1e-8)
         assert 0 < found <= 1
 
 
+@pytest.mark.parametrize("mu", [0.01, 1.0, 100.0])
+@pytest.mark.parametrize("dof", [1, 3])
+def test_graduated_weight_is_the_slope_of_its_cost(mu, dof):
+    c2 = chi2.ppf(GATE, dof)
+    low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
+    for nis in (0.5 * low, 0.9 * low + 0.1 * high, 0.2 * low + 0.8 * high, 1.5 * high):
+        h = 1e-5 * nis
+        ends = [losses.cost(np.array([nis + side * h]), "gnc", dof, mu) for side in (1, -1)]
+        assert losses.weight(np.array([nis]), "gnc", dof, mu)[0] == pytest.approx((ends[0] - ends[1]) / h, abs=1e-6)
+    assert losses.weight(np.array([1.1 * high]), "gnc", dof, mu)[0] == 0
+    assert losses.cost(np.array([1.1 * high]), "gnc", dof, mu) == pytest.approx(0.5 * c2)
+
+
+def test_first_of_the_graduated_losses_counts_every_row():
+    nis = np.array([0.1, 5.0, 1600.0])
+    assert np.all(losses.weight(nis, "gnc", 1, losses.first_mu(nis, 1)) > 0)
+
+
 @pytest.mark.parametrize("loss", LOSSES)
 def test_losses_are_half_the_square_for_good_rows_and_add_up(loss):
     small = np.array([1e-4, 2e-4, 5e-5])
-    assert graph.loss_cost(small, loss, 3) == pytest.approx(0.5 * small.sum(), rel=1e-4)
+    assert losses.cost(small, loss, 3) == pytest.approx(0.5 * small.sum(), rel=1e-4)
     many = np.array([0.1, 3.0, 7.0, 60.0, 1e4])
-    one_by_one = sum(graph.loss_cost(many[k : k + 1], loss, 3) for k in range(5))
-    assert graph.loss_cost(many, loss, 3) == pytest.approx(one_by_one, rel=1e-12)
-    assert graph.loss_cost(many, loss, 3) <= 0.5 * many.sum()
+    one_by_one = sum(losses.cost(many[k : k + 1], loss, 3) for k in range(5))
+    assert losses.cost(many, loss, 3) == pytest.approx(one_by_one, rel=1e-12)
+    assert losses.cost(many, loss, 3) <= 0.5 * many.sum()
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -74,14 +92,14 @@ def test_weighted_rows_have_the_gradient_of_the_loss(loss, sensor):
     x = np.tile(problem.prior.x, (len(problem.keyframe_edges), 1))  # far from the measurements: all weights matter
     c = problem.parameters.mean + 0.01
     block, nis = graph.sensor_block(rows, graph.States(x, c), free)
-    assert (nis > graph.threshold(rows.dof) ** 2).any()
+    assert (nis > losses.threshold(rows.dof) ** 2).any()
     direction, turn = rng.standard_normal((len(x), 15)), rng.standard_normal(len(free))
 
     def cost(step):
         moved = c.copy()
         moved[free] += step * turn
         _, nis = graph.sensor_block(rows, graph.States(correct_states(x, step * direction), moved), free)
-        return graph.loss_cost(nis, loss, rows.dof)
+        return losses.cost(nis, loss, rows.dof)
 
     h = 1e-6
     numeric = (cost(h) - cost(-h)) / (2 * h)

@@ -6,16 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states
-from tbmfg.problem import Problem
-from tbmfg.smoother import graph
+from tbmfg.problem import GATE, Problem
+from tbmfg.sensors import Rows
+from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
 from tbmfg.smoother.graph import States
 from tbmfg.timeseries import Floats
 
 MAX_ITERATIONS = 30
+STAGE_ITERATIONS = 2  # at each loss on the way to the truncated square
 OFFSET_REACH_S = 0.02  # a clock offset beyond the one found by ``prepare``: the prism's model is first order in it
 CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
 
@@ -39,40 +42,71 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
 
     Raises EstimationError when the unknowns are not determined.
     """
-    free, n, d = problem.parameters.free, len(x), problem.size
-    m = len(free)
-    clocks = [k for k in free if problem.parameters.names[k].endswith("clock_offset")]
-    states = States(x.copy(), c.copy())
-    imu = graph.imu_graph(problem, states.x), graph.no_bias(n)
-    blocks, nis, cost = _linearise(problem, imu, states, free)
-    damping, converged, iteration = 0.0, False, 0
-    while iteration < MAX_ITERATIONS and not converged:
-        iteration += 1
-        chain = eliminate(blocks + _damping(blocks, damping, n, d, m), n, d, m)
-        _check(problem, chain)
-        dx, dc = chain.solve()
-        candidate = States(correct_states(states.x, dx), states.c.copy())
-        candidate.c[free] += dc
-        candidate.c[clocks] = np.clip(candidate.c[clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
-        new_blocks, new_nis, new_cost = _linearise(problem, imu, candidate, free)
-        if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
-            converged = damping < 1e-6 and cost - new_cost < CONVERGED * 1e-3 * (1.0 + cost)
-            states, blocks, nis, cost = candidate, new_blocks, new_nis, new_cost
-            damping = 0.0 if damping < 1e-6 else damping * 0.1
-        else:
-            damping = max(10.0 * damping, 1e-4)
-            if damping > 1e8:
-                break
-        if progress is not None:
-            progress(iteration / (iteration + 3))
-    cov, c_cov = _covariances(problem, blocks, free)
-    return Smoothed(states.x, cov, states.c, c_cov, nis, iteration, converged)
+    descent = _Descent(problem, States(x.copy(), c.copy()), progress)
+    converged = descent.run(MAX_ITERATIONS)
+    doubted = [r for r in problem.rows if r.loss == "gnc" and (descent.nis[r.sensor] > chi2.ppf(GATE, r.dof)).any()]
+    if doubted:
+        mu = min(losses.first_mu(descent.nis[r.sensor], r.dof) for r in doubted)
+        while mu < losses.LAST_MU and not descent.decided(doubted, mu):
+            descent.run(STAGE_ITERATIONS, mu)
+            mu *= losses.GROWTH
+        converged = descent.run(MAX_ITERATIONS, losses.LAST_MU)
+    states, free = descent.states, problem.parameters.free
+    cov, c_cov = _covariances(problem, descent.blocks, free)
+    return Smoothed(states.x, cov, states.c, c_cov, descent.nis, descent.iterations, converged)
+
+
+class _Descent:
+    """Gauss-Newton from step to step, with what the present states make of the problem."""
+
+    def __init__(self, problem: Problem, states: States, progress: Callable[[float], None] | None) -> None:
+        self.problem, self.states, self.progress = problem, states, progress
+        self.imu = graph.imu_graph(problem, states.x), graph.no_bias(len(states.x))
+        names = problem.parameters.names
+        self.clocks = [k for k in problem.parameters.free if names[k].endswith("clock_offset")]
+        self.iterations = 0
+        self.blocks, self.nis = [], {}
+
+    def run(self, most: int, mu: float | None = None) -> bool:
+        """At most ``most`` steps under the loss at ``mu``; whether they converged."""
+        problem, free = self.problem, self.problem.parameters.free
+        n, d, m = len(self.states.x), problem.size, len(free)
+        self.blocks, self.nis, cost = _linearise(problem, self.imu, self.states, free, mu)
+        damping = 0.0
+        for _ in range(most):
+            self.iterations += 1
+            chain = eliminate(self.blocks + _damping(self.blocks, damping, n, d, m), n, d, m)
+            _check(problem, chain)
+            dx, dc = chain.solve()
+            candidate = States(correct_states(self.states.x, dx), self.states.c.copy())
+            candidate.c[free] += dc
+            candidate.c[self.clocks] = np.clip(candidate.c[self.clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
+            blocks, nis, new_cost = _linearise(problem, self.imu, candidate, free, mu)
+            if self.progress is not None:
+                self.progress(self.iterations / (self.iterations + 3))
+            if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
+                converged = damping < 1e-6 and cost - new_cost < CONVERGED * 1e-3 * (1.0 + cost)
+                self.states, self.blocks, self.nis, cost = candidate, blocks, nis, new_cost
+                if converged:
+                    return True
+                damping = 0.0 if damping < 1e-6 else damping * 0.1
+            else:
+                damping = max(10.0 * damping, 1e-4)
+                if damping > 1e8:
+                    return False
+        return False
+
+    def decided(self, doubted: list[Rows], mu: float) -> bool:
+        """Whether every row of the sensors in doubt counts in full or not at all."""
+        weights = np.concatenate([losses.weight(self.nis[r.sensor], r.loss, r.dof, mu) for r in doubted])
+        return bool(np.all((weights < 1e-3) | (weights > 1.0 - 1e-3)))
 
 
 def at(problem: Problem, x: Floats, c: Floats) -> Smoothed:
     """Covariances and residuals of the whole graph at given states: those of a solver that ends there."""
     free, states = problem.parameters.free, States(x, c)
-    blocks, nis, _ = _linearise(problem, (graph.imu_graph(problem, x), graph.no_bias(len(x))), states, free)
+    imu = graph.imu_graph(problem, x), graph.no_bias(len(x))
+    blocks, nis, _ = _linearise(problem, imu, states, free)
     cov, c_cov = _covariances(problem, blocks, free)
     return Smoothed(x, cov, c, c_cov, nis, 0, True)
 
@@ -86,8 +120,10 @@ def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tup
     return cov, c_cov
 
 
-def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block], dict[str, Floats], float]:
-    """All whitened rows at ``states``, squared normalised residuals by sensor, and the cost."""
+def _linearise(
+    problem: Problem, imu, states: States, free, mu: float | None = None
+) -> tuple[list[Block], dict[str, Floats], float]:
+    """All whitened rows at ``states`` weighted by their losses, squared normalised residuals by sensor, and the cost."""
     m, e = len(free), len(problem.drift_walk)
     prior = graph.prior_rows(problem.parameters, problem.prior.cov, free)
     mean = States(problem.prior.x[None], problem.parameters.mean)
@@ -97,9 +133,9 @@ def _linearise(problem: Problem, imu, states: States, free) -> tuple[list[Block]
     cost = 0.5 * sum(float(np.sum(block.b**2)) for block in blocks)
     nis = {}
     for rows in problem.rows:
-        block, nis[rows.sensor] = graph.sensor_block(rows, states, free)
+        block, nis[rows.sensor] = graph.sensor_block(rows, states, free, mu)
         blocks.append(block)
-        cost += graph.loss_cost(nis[rows.sensor], rows.loss, rows.dof)
+        cost += losses.cost(nis[rows.sensor], rows.loss, rows.dof, mu)
     return blocks, nis, cost
 
 

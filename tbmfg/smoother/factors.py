@@ -15,7 +15,8 @@ from gtsam.symbol_shorthand import A, B, C, D, V, X
 
 from tbmfg.problem import Problem
 from tbmfg.sensors import Rows
-from tbmfg.smoother.graph import preintegrate, threshold
+from tbmfg.smoother.graph import preintegrate
+from tbmfg.smoother.losses import threshold
 from tbmfg.state import BA, NAV, POS, ROT, VEL
 from tbmfg.timeseries import Floats
 
@@ -167,11 +168,11 @@ class Factors:
 
 
 def robust(sigma: Floats, loss: str) -> gtsam.noiseModel.Base:
-    """Diagonal noise under a loss, with the thresholds of ``graph.weight``."""
+    """Diagonal noise under a loss, with the thresholds of ``losses.weight``."""
     noise = noiseModel.Diagonal.Sigmas(sigma)
     if loss == "none":
         return noise
-    estimator = {"huber": noiseModel.mEstimator.Huber, "cauchy": noiseModel.mEstimator.Cauchy}[loss]
+    estimator = noiseModel.mEstimator.Huber if loss == "huber" else noiseModel.mEstimator.Cauchy
     return noiseModel.Robust.Create(estimator.Create(threshold(len(sigma))), noise)
 
 

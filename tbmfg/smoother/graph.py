@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from scipy.stats import chi2
 
 from tbmfg.inertial.strapdown import difference
 from tbmfg.problem import Parameters, Problem
 from tbmfg.sensors import Rows
+from tbmfg.smoother import losses
 from tbmfg.smoother.chain import Block
 from tbmfg.state import NAV, POS
 from tbmfg.timeseries import Floats
@@ -106,11 +106,11 @@ def imu_block(graph: gtsam.NonlinearFactorGraph, x: Floats, zero: gtsam.Values, 
     return Block(np.arange(n), sides[0], sides[1], np.zeros((n, 15, m)), b)
 
 
-def sensor_block(rows: Rows, states: States, free: np.ndarray) -> tuple[Block, Floats]:
+def sensor_block(rows: Rows, states: States, free: np.ndarray, mu: float | None = None) -> tuple[Block, Floats]:
     """A sensor's rows linearised and weighted by their loss, and their squared normalised residuals (n,)."""
     r, Ji, Jj, Jc = rows.evaluate(states.x, states.c)
     nis = np.sum(r**2, axis=1)
-    root = np.sqrt(weight(nis, rows.loss, rows.dof))[:, None]
+    root = np.sqrt(losses.weight(nis, rows.loss, rows.dof, mu))[:, None]
     A_c = np.zeros((len(r), r.shape[1], len(states.c)))
     A_c[:, :, rows.calib] = Jc
     binary = Jj.shape[2] > 0
@@ -142,28 +142,3 @@ def about(rows: Block, at: States, states: States, free: np.ndarray) -> Block:
     """Linear rows on keyframe 0 that were made about ``at``, about the first of ``states``."""
     move, change = difference(states.x[:1], at.x[:1])[0], (states.c - at.c)[free]
     return Block(rows.i, rows.A_i, None, rows.A_c, rows.b - rows.A_i @ move - rows.A_c @ change)
-
-
-def threshold(dof: int) -> float:
-    """Normalised residual from which a loss departs from the square: 95 % of good rows lie below."""
-    return float(np.sqrt(chi2.ppf(0.95, dof)))
-
-
-def weight(nis: Floats, loss: str, dof: int) -> Floats:
-    """IRLS weight of rows with squared normalised residual ``nis``."""
-    if loss == "none":
-        return np.ones_like(nis)
-    k, s = threshold(dof), np.sqrt(nis)
-    if loss == "huber":
-        return k / np.maximum(s, k)
-    return 1.0 / (1.0 + nis / k**2)
-
-
-def loss_cost(nis: Floats, loss: str, dof: int) -> float:
-    """Sum of the losses: half the square where a row is good."""
-    if loss == "none":
-        return 0.5 * float(nis.sum())
-    k, s = threshold(dof), np.sqrt(nis)
-    if loss == "huber":
-        return float(np.sum(np.where(s < k, 0.5 * nis, k * s - 0.5 * k**2)))
-    return float(np.sum(0.5 * k**2 * np.log1p(nis / k**2)))

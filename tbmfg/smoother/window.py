@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import B, V, X
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
 from tbmfg.problem import Problem
-from tbmfg.smoother import graph
+from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, marginal
 from tbmfg.smoother.graph import States
 from tbmfg.smoother.online import REANCHOR_INFLATION, Online
@@ -136,7 +136,7 @@ class _Window:
             if len(rows):
                 block, nis = graph.sensor_block(rows, states, self.free)
                 blocks.append(block)
-                doubted |= rows.loss != "none" and bool(np.any(nis[rows.j == last] > graph.threshold(rows.dof) ** 2))
+                doubted |= rows.loss != "none" and bool(np.any(nis[rows.j == last] > losses.threshold(rows.dof) ** 2))
         return blocks, doubted
 
 
