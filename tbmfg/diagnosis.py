@@ -94,6 +94,8 @@ def biased_stretches(problem: Problem, x: Floats, c: Floats) -> list[tuple[Inter
             far = binary_closing(np.pad(sign * median > BIASED, MEDIAN_ROWS), np.ones(MEDIAN_ROWS))
             edges = np.flatnonzero(np.diff(far[MEDIAN_ROWS - 1 : 1 - MEDIAN_ROWS].astype(int)))
             for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
+                if last - first < MEDIAN_ROWS // 2:
+                    continue  # a bias long enough to move the median keeps it there longer
                 size = float(np.median((residual * rows.sigma[:, 0])[first : last + 1]))
                 found.append((Interval(rows.sensor, "biased", int(t_ns[first]), int(t_ns[last])), size))
     return sorted(found, key=lambda one: one[0].start_ns)

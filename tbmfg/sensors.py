@@ -298,9 +298,11 @@ class Rows:
     def dof(self) -> int:
         return self.sigma.shape[1]
 
-    def between(self, first: int, last: int) -> Rows:
-        """The rows on the keyframes ``first`` to ``last`` alone, counted from ``first``."""
+    def between(self, first: int, last: int, out: np.ndarray) -> Rows:
+        """The rows on keyframes ``first`` to ``last`` alone, counted from ``first``, without those in ``out`` (n,)."""
         own = slice(np.searchsorted(self.i, first), np.searchsorted(self.j, last, side="right"))
+        if out[own].any():
+            own = np.arange(own.start, own.stop)[~out[own]]
         parts = (self.z[own], self.data[own], self.sigma[own], self.calib, self.samples[own], self.loss)
         return Rows(self.sensor, self.model, self.i[own] - first, self.j[own] - first, *parts)
 

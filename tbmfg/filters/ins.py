@@ -21,7 +21,9 @@ from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
-REOPEN = 10  # rows of one sensor gated in a row after which the next is let in: the state is wrong, not the sensor
+# Rows of one sensor gated in a row after which the next is let in: then the state is wrong, not the sensor. A sensor
+# whose loss is gnc may be biased for long, and stays out until it agrees again.
+REOPEN = 10
 TAIL = (
     4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it
 )
@@ -90,7 +92,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
                 value, logdet = innovation(P, H, residual)
                 nis[sensor][r] = value
                 cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
-                if value > gates[sensor] and in_a_row[sensor] < REOPEN:
+                if value > gates[sensor] and (in_a_row[sensor] < REOPEN or rows.loss == "gnc"):
                     gated[sensor][r] = True
                     in_a_row[sensor] += 1
                     continue

@@ -123,7 +123,7 @@ def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tup
 def _linearise(
     problem: Problem, imu, states: States, free, mu: float | None = None
 ) -> tuple[list[Block], dict[str, Floats], float]:
-    """All whitened rows at ``states`` weighted by their losses, squared normalised residuals by sensor, and the cost."""
+    """All whitened rows at ``states``, weighted by their losses; squared normalised residuals by sensor; the cost."""
     m, e = len(free), len(problem.drift_walk)
     prior = graph.prior_rows(problem.parameters, problem.prior.cov, free)
     mean = States(problem.prior.x[None], problem.parameters.mean)

@@ -1,9 +1,9 @@
 """What a row far from the estimate counts: Huber, Cauchy, and truncated squares by graduated non-convexity.
 
-A row's size is its squared normalised residual, ``nis``. A bias that lasts defeats Huber (every row pulls on) and draws
-Cauchy; truncated squares leave it out altogether, but have many minima. Graduated non-convexity (Yang et al., "Graduated
-Non-Convexity for Robust Spatial Perception", 2020, sec. IV) begins with nearly the square, ``mu`` near 0, and goes over
-to the truncated one.
+A row's size is its squared normalised residual, ``nis``. A bias that lasts defeats Huber (every row pulls on) and
+draws Cauchy; truncated squares leave it out altogether, but have many minima. Graduated non-convexity (Yang et al.,
+"Graduated Non-Convexity for Robust Spatial Perception", 2020, sec. IV) begins with nearly the square, ``mu`` near 0,
+and goes over to the truncated one.
 """
 
 from __future__ import annotations

@@ -13,10 +13,11 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
+from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
-from tbmfg.problem import Problem
+from tbmfg.problem import GATE, Problem
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, marginal
 from tbmfg.smoother.graph import States
@@ -46,6 +47,7 @@ class _Window:
             np.zeros(0, dtype=int), *np.zeros((2, 0, 15, d)), np.zeros((0, 15, len(free))), np.zeros((0, 15))
         )
         self.times, self.zero = problem.keyframes_s, graph.no_bias(2)
+        self.out = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
         self.chain: Elimination | None = None  # as solved last
 
     def extend(self) -> None:
@@ -81,6 +83,20 @@ class _Window:
             if not self._relinearise() and not doubted:
                 break
         self.chain = chain
+
+    def shut_out(self, k: int, cov: Floats) -> None:
+        """Leave out rows of keyframe k, the newest, that its prediction contradicts beyond the gate, from sensors
+        whose loss is gnc: they may be biased for long, and no window is long enough to tell later. ``cov`` is that of
+        the keyframe before."""
+        for rows in self.problem.rows:
+            own = slice(*np.searchsorted(rows.j, [k, k + 1]))
+            if rows.loss != "gnc" or own.start == own.stop or rows.i[own.start] != k:
+                continue
+            x = np.repeat(self.x[-1:], own.stop - own.start, axis=0)
+            r, J, *_ = rows.evaluate_at(x, x, self.c, own)
+            S = J @ cov @ J.transpose(0, 2, 1) + np.eye(rows.dof)
+            nis = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r)
+            self.out[rows.sensor][own] = nis > chi2.ppf(GATE, rows.dof)
 
     def leave(self, count: int, out: Online) -> None:
         """Let the oldest ``count`` keyframes leave, one at least stays; kept in ``out`` as they were solved last."""
@@ -132,7 +148,7 @@ class _Window:
                 blocks.append(graph.drift_block(self.problem, elapsed, states, m))
         doubted = False
         for every in self.problem.rows:
-            rows = every.between(self.first, self.first + last)
+            rows = every.between(self.first, self.first + last, self.out[every.sensor])
             if len(rows):
                 block, nis = graph.sensor_block(rows, states, self.free)
                 blocks.append(block)
@@ -152,6 +168,7 @@ def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None
                 leaving = np.searchsorted(times, times[k] - lag_s) - window.first
                 window.leave(min(leaving, k - 1 - window.first), out)
             window.extend()
+            window.shut_out(k, out.causal_cov[k - 1])
         guess = window.x[-1]
         try:
             window.solve()
