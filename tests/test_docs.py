@@ -1,4 +1,4 @@
-"""The pages under docs: their examples run, their commands parse, their messages exist, the rig reference is current."""
+"""The pages under docs: examples run, commands parse, messages exist, and the rig reference is current."""
 
 import re
 import runpy
@@ -13,7 +13,7 @@ import typer.main
 from datasets.__main__ import main as make_dataset
 from tbmfg.cli import app
 from tbmfg.estimators import ESTIMATORS, OWN
-from tbmfg.rig import KINDS, OWN_KINDS, parse_rig
+from tbmfg.rig import KINDS, parse_rig
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -49,14 +49,24 @@ def as_modules(page: Path, monkeypatch) -> list[str]:
         group, name, value = re.fullmatch(r'\[project\.entry-points\."([\w.]+)"\]\n(\w+) = "(.*)"\n', text).groups()
         points.append(EntryPoint(name, value, group))
     monkeypatch.setattr("tbmfg.registry.entry_points", lambda group: [p for p in points if p.group == group])
-    for registry, own in ((ESTIMATORS, OWN), (KINDS, OWN_KINDS)):
-        monkeypatch.delitem(registry.__dict__, "data", raising=False)
-        monkeypatch.setitem(registry.__dict__, "_own", dict(own))
     return rest
 
 
+@pytest.fixture
+def registries():
+    """Both read their entry points anew, before the test and after it."""
+
+    def forget() -> None:
+        for registry in (ESTIMATORS, KINDS):
+            registry.__dict__.pop("data", None)
+
+    forget()
+    yield
+    forget()
+
+
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
-def test_python_runs(page, drive, monkeypatch):
+def test_python_runs(page, drive, registries, monkeypatch):
     monkeypatch.chdir(drive.parent)
     code = as_modules(page, monkeypatch)
     for text in blocks(page, "yaml"):
@@ -64,17 +74,13 @@ def test_python_runs(page, drive, monkeypatch):
         Path(f"{rig.name}.yaml").write_text(text, "utf-8")
     for one in code:
         exec(one, {})
-    for registry in (ESTIMATORS, KINDS):
-        registry.__dict__.pop("data", None)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "yaml")], ids=lambda page: page.stem)
-def test_rigs_parse(page, monkeypatch):
+def test_rigs_parse(page, registries, monkeypatch):
     as_modules(page, monkeypatch)
     for text in blocks(page, "yaml"):
         assert parse_rig(text, page.name).sensors["imu"]
-    for registry in (ESTIMATORS, KINDS):
-        registry.__dict__.pop("data", None)
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)

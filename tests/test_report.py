@@ -256,8 +256,8 @@ def test_the_states_of_a_shaft_machine_are_shown_where_there_are_any():
     state = {"start_s": 0.0, "end_s": 9.0, "level": "stop", "case": 3, "direction": "up <left>", "spot_mm": [1.0, -2.5]}
     made.summaries["estimator-0"] = made.summaries["estimator-0"] | {"deviation": {"timeline": [state]}}
     figure = next(figure for figure in drawn(made) if figure.title.startswith("Deviation"))
-    assert figure.data[0]["name"] == "stop"
-    assert "direction: up &lt;left&gt;<br>spot mm: 1, -2.5" in figure.data[0]["text"][0]
+    assert [trace["name"] for trace in figure.data] == ["normal", "troubleshoot", "stop"]
+    assert "direction: up &lt;left&gt;<br>spot mm: 1, -2.5" in figure.data[2]["text"][0]
 
 
 def test_an_hour_at_ten_hertz_stays_small():

@@ -18,7 +18,7 @@ FINEST = 1 / 400  # of the time shown: what is shorter is drawn this long, what 
 PRESENT = "#56B4E9"
 KINDS = {"outage": "#D55E00", "gap": "#000000", "gated": "#E69F00", "standing": "#009E73"}
 OTHER_KIND = "#CC79A7"
-LEVEL_COLOURS = ("#009E73", "#E69F00", "#D55E00", "#CC79A7", "#0072B2")
+LEVELS = {"normal": "#009E73", "troubleshoot": "#E69F00", "stop": "#D55E00"}
 
 
 def availability(report: Report, pen: dict[str, Pen]) -> Figure:
@@ -59,11 +59,10 @@ def deviation(report: Report, pen: dict[str, Pen]) -> Figure | None:
         "Level by the dual-coordinate method; point at a bar for the case, the direction of the deviation, the spot on "
         "the detector and the angles.",
     )
-    levels = list(dict.fromkeys(str(state["level"]) for states in told.values() for state in states))
-    for level, colour in zip(levels, LEVEL_COLOURS, strict=False):
+    for level, colour in LEVELS.items():
         bars, texts = [], []
         for row, states in enumerate(told.values()):
-            own = [state for state in states if str(state["level"]) == level]
+            own = [state for state in states if state["level"] == level]
             bars += [(row, state["start_s"], state["end_s"]) for state in own]
             texts += [_state_in_words(state) for state in own]
         figure.data.append(_bars(escape(level), colour, 14, bars, True, texts))
