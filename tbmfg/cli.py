@@ -47,12 +47,18 @@ def selection(
     ] = [],  # noqa: B006 - typer reads defaults, never changes them
     without: Annotated[list[str], typer.Option(metavar="SENSOR", help="Drop a sensor. Repeatable.")] = [],  # noqa: B006
     only: Annotated[str, typer.Option(metavar="A,B", help="Keep just these sensors and the IMU.")] = "",
+    start: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="Leave out what was logged before; from the log's start.")
+    ] = None,
+    end: Annotated[float | None, typer.Option(metavar="S", help="Leave out what was logged from there on.")] = None,
     overrides: Annotated[
         list[str],
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override a value of the rig. Repeatable."),
     ] = [],  # noqa: B006
 ) -> dict[str, Any]:
     """What every command that estimates takes: the options of :func:`tbmfg.pipeline.run`."""
+    if end is not None and not (start or 0.0) < end:
+        raise typer.BadParameter(f"{end:g} s is not after --start {start or 0.0:g} s", param_hint="--end")
     return {
         "rig": rig,
         "truth": truth,
@@ -60,6 +66,8 @@ def selection(
         "without": [name for names in without for name in split_names(names)],
         "only": split_names(only),
         "overrides": [checked_override(text) for text in overrides],
+        "start_s": start,
+        "end_s": end,
     }
 
 

@@ -39,6 +39,7 @@ Outage = tuple[str, float, float]
 
 ATTACHED_RIG = "rig.yaml"
 COMPARISON = "compare.json"
+UNUSED = ("pose_cov", "twist_cov")  # columns of odometry, most of its bytes: no sensor and no truth takes them
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,18 +133,32 @@ def open_session(
     without: Collection[str] = (),
     only: Collection[str] = (),
     overrides: Sequence[str] = (),
+    start_s: float | None = None,
+    end_s: float | None = None,
     progress: Progress | None = None,
 ) -> Session:
     """Read and prepare a log; the arguments are those of :func:`run_result`."""
     from tbmfg.estimators import check_switches
-    from tbmfg.mcap import read_log
+    from tbmfg.mcap import read_attachments, read_log
     from tbmfg.prepare import prepare
 
     started = time.perf_counter()
+    assumed: list[str] = []
     log = log_path
-    if not isinstance(log, Log):
-        log = read_log(log_path, progress=partial(progress, "reading") if progress else None)
-    rig, assumed = rig_for(log, rig, overrides)
+    if isinstance(log, Log):
+        if (start_s, end_s) != (None, None):
+            raise TbmfgError(f"{log.path}: start_s and end_s choose what is read, and this log has been read")
+        rig = given_rig(rig, log.attachments, log.path, overrides)
+    else:
+        rig = given_rig(rig, {} if rig is not None else read_attachments(log_path), log_path, overrides)
+        part: dict[str, Any] = {"start_s": start_s, "end_s": end_s}
+        if rig is not None:
+            part |= {"topics": topics_for(rig, truth), "leave": UNUSED}
+        log = read_log(log_path, progress=partial(progress, "reading") if progress else None, **part)
+        if rig is None:  # a log that was cut lists no attachments and may have some
+            rig = given_rig(None, log.attachments, log.path, overrides)
+    if rig is None:
+        rig, assumed = inferred_rig(log, overrides)
     check_switches(rig)
     dropped = dropped_sensors(rig, without, only)
     reference = find_truth(truth, log, rig)
@@ -152,7 +167,13 @@ def open_session(
     except EstimationError as error:
         left_out = [line for line in assumed if not line.startswith("assumed")]
         raise EstimationError("; ".join([str(error), *left_out])) from error
-    options = {"outages": list(outages), "without": dropped, "set": list(overrides)}
+    options = {
+        "outages": list(outages),
+        "without": dropped,
+        "set": list(overrides),
+        "start_s": start_s,
+        "end_s": end_s,
+    }
     shared_s = time.perf_counter() - started
     path = log_path.path if isinstance(log_path, Log) else str(log_path)
     return Session(log, path, prepared, reference, tuple(assumed), options, shared_s)
@@ -180,7 +201,9 @@ def run_result(
     ``options``: ``rig``, a Rig, a shipped name or a file; None takes the one attached to the log, else infers one.
     ``truth``: auto, none, a topic or a file. ``outages``: (sensor, start, end) in seconds from the first IMU sample,
     stamps as recorded. ``without`` drops sensors, ``only`` keeps just these and the IMU. ``overrides``:
-    ``key.path=value`` over the rig. ``progress`` is called with the stage and the done fraction of it.
+    ``key.path=value`` over the rig. ``start_s``, ``end_s``: only what was logged between, in seconds from the first
+    message of the recording; outages then count from the first IMU sample of this part. ``progress`` is called with
+    the stage and the done fraction of it.
     """
     known_estimators([estimator])
     if output is not None:
@@ -264,24 +287,38 @@ def known_estimators(names: Sequence[str]) -> None:
             raise TbmfgError(f"no estimator {name!r}; there are {', '.join(ESTIMATORS)}")
 
 
-def rig_for(log: Log, rig: Rig | str | Path | None, overrides: Sequence[str] = ()) -> tuple[Rig, list[str]]:
-    """The rig given, else the one attached to the log, else one inferred from it, with ``overrides`` applied; and
-    what was assumed for an inferred one."""
-    assumed: list[str] = []
-    if rig is None and ATTACHED_RIG in log.attachments:
-        source = f"{log.path}: attachment {ATTACHED_RIG}"
+def given_rig(
+    rig: Rig | str | Path | None, attachments: Mapping[str, bytes], log_path: str | Place, overrides: Sequence[str] = ()
+) -> Rig | None:
+    """The rig given, else the one attached to the log, with ``overrides`` applied; None where there is neither."""
+    if rig is None and ATTACHED_RIG in attachments:
+        source = f"{log_path}: attachment {ATTACHED_RIG}"
         try:
-            rig = parse_rig(log.attachments[ATTACHED_RIG].decode("utf-8"), source)
+            rig = parse_rig(attachments[ATTACHED_RIG].decode("utf-8"), source)
         except UnicodeDecodeError as error:
             raise RigError(f"{source}: cannot be read: not UTF-8 text") from error
-    elif rig is None:
-        from tbmfg.inference import infer
-
-        inferred = infer(log)
-        rig, assumed = inferred.rig, inferred.lines()
-    elif not isinstance(rig, Rig):
+    elif rig is not None and not isinstance(rig, Rig):
         rig = load_rig(rig)
-    return override(rig, overrides) if overrides else rig, assumed
+    return override(rig, overrides) if rig is not None and overrides else rig
+
+
+def inferred_rig(log: Log, overrides: Sequence[str] = ()) -> tuple[Rig, list[str]]:
+    """A rig inferred from what the log shows, with ``overrides`` applied, and what was assumed for it."""
+    from tbmfg.inference import infer
+
+    inferred = infer(log)
+    return override(inferred.rig, overrides) if overrides else inferred.rig, inferred.lines()
+
+
+def topics_for(rig: Rig, truth: str) -> Callable[[str], bool] | None:
+    """What tells the topics that a run reads: the rig's sensors and its truth; None for all of them.
+
+    A ``truth`` that is named may be any topic, and what else could be meant is said where it is none.
+    """
+    if truth not in ("auto", "none"):
+        return None
+    known = {sensor.topic for sensor in rig.sensors.values()} | ({rig.truth.topic} if rig.truth is not None else set())
+    return lambda topic: topic in known or (truth == "auto" and "truth" in topic.lower())
 
 
 def init(log_path: str | Place, output: str | Place, *, force: bool = False) -> list[str]:

@@ -88,8 +88,8 @@ class Transform:
 class Log:
     """A recording: series by topic, clouds by topic (lazy), and what was lost on the way.
 
-    ``unknown`` maps each topic that was skipped to its type; ``damage`` holds one line for every
-    part of the file that could not be read.
+    ``unknown`` maps each topic that was skipped to its type, ``unread`` those that were not asked for; ``damage``
+    holds one line for every part of the file that could not be read.
     """
 
     path: str
@@ -99,6 +99,7 @@ class Log:
     attachments: dict[str, bytes] = field(default_factory=dict)
     unknown: dict[str, str] = field(default_factory=dict)
     damage: tuple[str, ...] = ()
+    unread: dict[str, str] = field(default_factory=dict)
 
 
 def seconds(t_ns: Times, origin_ns: int) -> Floats:

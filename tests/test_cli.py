@@ -62,9 +62,10 @@ def toy_estimate(name, prepared, *, progress=None) -> Result:
 @pytest.fixture
 def toy(monkeypatch):
     """The stages replaced by fakes; the calls that reach them are recorded."""
-    calls = SimpleNamespace(prepare=[], logs={"toy.mcap": toy_log()})
+    calls = SimpleNamespace(prepare=[], parts=[], logs={"toy.mcap": toy_log()})
 
-    def read_log(path, *, progress=None):
+    def read_log(path, *, progress=None, **part):
+        calls.parts.append(part)
         if str(path) not in calls.logs:
             raise LogError(f"{path}: no such file")
         return calls.logs[str(path)]
@@ -82,6 +83,7 @@ def toy(monkeypatch):
     monkeypatch.setitem(sys.modules, "tbmfg.estimators", fakes)
     monkeypatch.setitem(sys.modules, "tbmfg.prepare", SimpleNamespace(prepare=prepare))
     monkeypatch.setattr("tbmfg.mcap.read_log", read_log)
+    monkeypatch.setattr("tbmfg.mcap.read_attachments", lambda path: read_log(path).attachments)
     return calls
 
 
@@ -134,12 +136,15 @@ def test_options_reach_the_stages(toy, tmp_path):
     ran = tbmfg(
         *("run", "toy.mcap", "-o", str(tmp_path), "--truth", "none"),
         *("--outage", "prism:2:4.5", "--outage", "prism:6:7", "--without", "odometer"),
-        *("--set", "sensors.prism.sigma_mm=7", "--set", "lag_s=3"),
+        *("--set", "sensors.prism.sigma_mm=7", "--set", "lag_s=3", "--start", "1.5", "--end", "60"),
     )
     assert ran.exit_code == 0, ran.output
     (call,) = toy.prepare
     assert call["outages"] == (("prism", 2.0, 4.5), ("prism", 6.0, 7.0))
     assert call["without"] == ("odometer",)
+    read = toy.parts[-1]
+    assert (read["start_s"], read["end_s"]) == (1.5, 60.0)
+    assert [topic for topic in ("/imu", "/prism", "/camera", "/truth") if read["topics"](topic)] == ["/imu", "/prism"]
     assert call["rig"].sensors["prism"].sigma_mm == 7
     assert call["rig"].lag_s == 3
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -241,6 +246,8 @@ def test_an_unknown_estimator_is_an_error_in_python_too(toy):
     "wrong",
     [
         ["--outage", "prism:4:2"],
+        ["--start", "-1"],
+        ["--start", "5", "--end", "5"],
         ["--outage", "prism:1"],
         ["--outage", "1:2"],
         ["--outage", "prism:a:b"],

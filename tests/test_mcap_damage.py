@@ -195,7 +195,7 @@ def test_a_damaged_summary_without_a_checksum(path, written):
     path.write_bytes(data)
     log = read_log(path)
     assert assert_part_of(log, written) == 250
-    assert log.damage[0].startswith("x.mcap: the index of a chunk cannot be read")
+    assert log.damage[0].startswith("x.mcap: an index in the summary cannot be read")
 
 
 # ---- outside chunks ----

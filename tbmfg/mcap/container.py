@@ -6,7 +6,7 @@ import os
 import struct
 import zlib
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from types import TracebackType
 from typing import NamedTuple
@@ -16,7 +16,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Footer, Schema
+from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Schema
 
 from tbmfg.errors import LogError
 from tbmfg.storage import Place, place
@@ -63,6 +63,8 @@ class McapFile:
         self.attachments: dict[str, bytes] = {}
         self.damage: list[str] = []
         self.position = 0
+        self.index: dict[int, ChunkIndex] = {}  # by the chunk's first byte
+        self._listed: list[AttachmentIndex] = []
         try:
             self._file = path.open("rb")
             self.size = self._file.seek(0, os.SEEK_END)
@@ -79,7 +81,8 @@ class McapFile:
             kind = next((text for magic, text in _FOREIGN.items() if start.startswith(magic)), None)
             detail = kind or f"{self.size} bytes, beginning with {start[:8]!r}; record with: ros2 bag record -s mcap"
             raise LogError(f"{path}: not an MCAP file ({detail})")
-        self._chunks = self._read_summary()
+        self._read_summary()
+        self._chunks = sorted(self.index)
 
     def __enter__(self) -> McapFile:
         return self
@@ -87,8 +90,19 @@ class McapFile:
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._file.close()
 
-    def blocks(self) -> Iterator[Block]:
-        """All readable records of the data section in file order; ``position`` tells how far it came."""
+    def listed_attachments(self) -> dict[str, bytes]:
+        """The attachments that the summary lists, read without what lies between them."""
+        for one in self._listed:
+            opcode, length = self._head(one.offset)
+            if opcode == Opcode.ATTACHMENT and one.offset + HEAD.size + length <= self.size:
+                self._attachment(one.offset, length)
+        return self.attachments
+
+    def blocks(self, wanted: Callable[[ChunkIndex], bool] | None = None) -> Iterator[Block]:
+        """All readable records of the data section in file order; ``position`` tells how far it came.
+
+        Chunks in the index that are not ``wanted`` are passed over unread.
+        """
         at, raw, raw_start = len(MAGIC), bytearray(), 0
         checksummed = True  # nothing so far but records that carry a checksum of their own
         while True:
@@ -114,7 +128,8 @@ class McapFile:
                 raw += self._read(at, HEAD.size + length)
                 checksummed = checksummed and opcode != Opcode.MESSAGE
             elif opcode == Opcode.CHUNK:
-                yield from self._chunk(at, length)
+                if wanted is None or at not in self.index or wanted(self.index[at]):
+                    yield from self._chunk(at, length)
             elif opcode == Opcode.ATTACHMENT:
                 self._attachment(at, length)
             elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
@@ -175,33 +190,35 @@ class McapFile:
                 "the file was cut or overwritten there"
             )
 
-    def _read_summary(self) -> list[int]:
-        """Declarations from the summary section; the byte offsets of the chunks it lists, sorted."""
+    def _read_summary(self) -> None:
+        """Take up the summary section: declarations, the index of the chunks, where attachments lie."""
         footer_at = self.size - len(MAGIC) - _FOOTER_SIZE
         tail = self._read(max(footer_at, 0), _FOOTER_SIZE + len(MAGIC))
         if footer_at < 0 or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
-            return []
+            return
         footer = Footer.read(_stream(tail[HEAD.size :]))
         if not len(MAGIC) <= footer.summary_start < footer_at:
-            return []
+            return
         summary = self._read(footer.summary_start, footer_at - footer.summary_start)
         crc = zlib.crc32(summary + tail[: HEAD.size + 16])  # up to the checksum itself
         if footer.summary_crc not in (0, crc):
             self.damage.append(f"{self.name}: the summary at byte {footer.summary_start} is damaged and was not used")
-            return []
-        chunks, at = [], 0
+            return
+        at = 0
         while at + HEAD.size <= len(summary):
             opcode, length = HEAD.unpack_from(summary, at)
             at += HEAD.size + length
             body = summary[at - length : at]
-            if opcode != Opcode.CHUNK_INDEX:
-                self.declare(opcode, body)
-                continue
             try:
-                chunks.append(ChunkIndex.read(_stream(body)).chunk_start_offset)
+                if opcode == Opcode.CHUNK_INDEX:
+                    chunk = ChunkIndex.read(_stream(body))
+                    self.index[chunk.chunk_start_offset] = chunk
+                elif opcode == Opcode.ATTACHMENT_INDEX:
+                    self._listed.append(AttachmentIndex.read(_stream(body)))
+                else:
+                    self.declare(opcode, body)
             except _RECORD_ERRORS as error:
-                self.damage.append(f"{self.name}: the index of a chunk cannot be read ({error})")
-        return sorted(chunks)
+                self.damage.append(f"{self.name}: an index in the summary cannot be read ({error})")
 
     def _chunk(self, at: int, length: int) -> Iterator[Block]:
         data, fault = _unpack(self._read(at + HEAD.size, length))

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,10 @@ class Layout:
     @property
     def columns(self) -> tuple[Field, ...]:
         return tuple(f for f in self.fields if f.kind != "str" and not f.name.startswith("_"))
+
+    def without(self, names: Collection[str]) -> Layout:
+        """The same layout, which reads past these columns."""
+        return replace(self, fields=tuple(replace(f, name=f"_{f.name}") if f.name in names else f for f in self.fields))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,18 +107,19 @@ LAYOUTS = {
 ONE_TRANSFORM = _layout("_length:u4 " + _HEADER + "child_frame_id:str " + _POSE, "")
 
 
-def decode(layout: Layout, payloads: Sequence[bytes]) -> Rows:
-    """CDR messages of one type (encapsulation included) as columns; payloads that do not fit are left out."""
-    n = len(payloads)
+def decode(layout: Layout, data: NDArray[np.uint8], sizes: Times) -> Rows:
+    """CDR messages of one type (encapsulation included) as columns; those that do not fit are left out.
+
+    ``data`` holds the messages one after the other, ``sizes`` (n,) bytes each.
+    """
+    n, ends = len(sizes), np.cumsum(sizes)
     good = np.zeros(n, dtype=bool)
     t_ns = np.zeros(n, dtype=np.int64)
     columns = {f.name: np.empty((n, f.count) if f.count > 1 else n) for f in layout.columns}
     strings: dict[str, str] = {}
-    sizes = np.fromiter(map(len, payloads), dtype=np.int64, count=n)
     for size in np.unique(sizes):
         rows = np.flatnonzero(sizes == size)
-        same_size = payloads if len(rows) == n else [payloads[i] for i in rows]
-        block = np.frombuffer(b"".join(same_size), dtype=np.uint8).reshape(len(rows), size)
+        block = data.reshape(n, size) if len(rows) == n else data[(ends[rows] - size)[:, None] + np.arange(size)]
         while len(rows):
             dtype, fixed, names = _place(layout, block[0].tobytes())
             alike = (block[:, fixed] == block[0, fixed]).all(axis=1)

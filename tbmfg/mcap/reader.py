@@ -3,28 +3,70 @@
 from __future__ import annotations
 
 import os
-import struct
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 
+import numpy as np
 import yaml
-from mcap.opcode import Opcode
-from mcap.records import Channel
+from mcap.records import Channel, ChunkIndex
+from numpy.typing import NDArray
 
 from tbmfg.errors import LogError
 from tbmfg.mcap import clouds
-from tbmfg.mcap.container import HEAD, Block, McapFile
+from tbmfg.mcap.container import Block, McapFile
 from tbmfg.mcap.layouts import LAYOUTS
+from tbmfg.mcap.records import walk
 from tbmfg.mcap.schemas import full_name
 from tbmfg.mcap.stamps import eras
-from tbmfg.mcap.streams import TRANSFORMS, CloudStream, Entries, SeriesStream, Stream, TransformStream
+from tbmfg.mcap.streams import TRANSFORMS, CloudStream, SeriesStream, Stream, TransformStream
 from tbmfg.storage import Place, is_folder, place
-from tbmfg.timeseries import Log
+from tbmfg.timeseries import NS, Log, Times
 
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _SCHEMA_ENCODINGS = ("ros2msg", "ros2idl")
+
+
+Topics = Collection[str] | Callable[[str], bool] | None
+
+
+@dataclass(slots=True)
+class Wanted:
+    """The part of a recording that is read; see :func:`read_log`. ``origin_ns`` is the first log time, once known."""
+
+    topics: Topics = None
+    start_s: float | None = None
+    end_s: float | None = None
+    leave: Collection[str] = ()
+    origin_ns: int | None = None
+
+    def topic(self, name: str) -> bool:
+        if self.topics is None:
+            return True
+        return self.topics(name) if callable(self.topics) else name in self.topics
+
+    def begins(self, log_ns: Collection[int]) -> None:
+        """Log times among which is the first of the recording; of later files and blocks they count no more."""
+        if self.origin_ns is None and len(log_ns):
+            self.origin_ns = int(min(log_ns))
+
+    @property
+    def window(self) -> tuple[float, float] | None:
+        """Log times in ns that the window begins and ends at; None where there is none."""
+        if self.origin_ns is None or (self.start_s is None and self.end_s is None):
+            return None
+        first, last = self.start_s or 0.0, np.inf if self.end_s is None else self.end_s
+        return self.origin_ns + round(first * NS), self.origin_ns + (last * NS if last == np.inf else round(last * NS))
+
+    def inside(self, log_ns: Times) -> NDArray[np.bool_]:
+        first, last = self.window
+        return (log_ns >= first) & (log_ns < last)
+
+    def overlaps(self, first_ns: int, last_ns: int) -> bool:
+        if self.window is None:
+            return True
+        first, last = self.window
+        return last_ns >= first and first_ns < last
 
 
 @dataclass(slots=True)
@@ -35,6 +77,7 @@ class Recording:
     streams: dict[str, Stream] = field(default_factory=dict)
     unknown: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     messages: int = 0
 
@@ -50,30 +93,39 @@ class Recording:
             self.attachments,
             self.unknown,
             (*self.damage, *(f"{s.topic}: messages that cannot be decoded: {s.undecodable}" for s in undecoded)),
+            self.unread,
         )
 
 
 def read_log(
     path: str | os.PathLike,
-    topics: Collection[str] | None = None,
+    topics: Topics = None,
     *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    leave: Collection[str] = (),
     progress: Callable[[float], None] | None = None,
 ) -> Log:
     """A recording in columns: ``path`` is an .mcap file or a rosbag2 folder with metadata.yaml, here or at a URL.
 
-    With ``topics`` only these become series and clouds; static transforms and attachments are always read.
+    With ``topics``, names or what tells them, only these become series and clouds, and ``Log.unread`` lists the others;
+    static transforms and attachments are always read. ``start_s`` and ``end_s`` keep the messages logged between, in
+    seconds from the first message of the recording. Chunks that hold nothing of this are not even unpacked. Columns
+    named in ``leave`` are not kept.
+
     ``progress`` is called with the fraction done, 0 to 1. Damaged parts are skipped and described in
     ``Log.damage``. Raises LogError where nothing can be read.
     """
-    return scan(path, topics, progress).log()
+    return scan(path, Wanted(topics, start_s, end_s, leave), progress).log()
 
 
 def scan(
     path: str | os.PathLike,
-    topics: Collection[str] | None = None,
+    wanted: Wanted | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Recording:
-    """One pass over all files of a recording; arguments and errors as ``read_log``."""
+    """One pass over all files of a recording; errors as ``read_log``."""
+    wanted = wanted or Wanted()
     recording = Recording(str(path))
     files = recording_files(path)
     sizes = [file.stat().st_size if file.is_file() else 0 for file in files]
@@ -86,18 +138,32 @@ def scan(
             recording.damage.append(str(error))
             continue
         with mcap:
-            distributor = _Distributor(recording, mcap, topics)
-            for block in mcap.blocks():
+            distributor = _Distributor(recording, mcap, wanted)
+            for block in mcap.blocks(distributor.holds_any):
                 distributor.take(block)
                 if progress:
                     progress((sum(sizes[:number]) + mcap.position) / sum(sizes))
             distributor.finish()
+    if not recording.messages and wanted.window and wanted.origin_ns is not None:
+        first, last = wanted.start_s or 0.0, np.inf if wanted.end_s is None else wanted.end_s
+        raise LogError(
+            f"{path}: no message between {first:g} and {last:g} s of the log; tbmfg info says how long it is"
+        )
     if not recording.messages:
         reasons = recording.damage[:4] + ["..."] * (len(recording.damage) > 4)
         raise LogError("; ".join([f"{path}: no message could be read from {sum(sizes)} bytes", *reasons]))
     if progress:
         progress(1.0)
     return recording
+
+
+def read_attachments(path: str | os.PathLike | Place) -> dict[str, bytes]:
+    """The attachments that the summaries of a recording list, without reading anything else; errors as ``read_log``."""
+    found: dict[str, bytes] = {}
+    for file in recording_files(path):
+        with McapFile(file) as mcap:
+            found |= mcap.listed_attachments()
+    return found
 
 
 def recording_files(path: str | os.PathLike | Place) -> list[Place]:
@@ -130,35 +196,42 @@ def recording_files(path: str | os.PathLike | Place) -> list[Place]:
 class _Distributor:
     """Hands the messages of one file to the streams of their topics."""
 
-    def __init__(self, recording: Recording, mcap: McapFile, topics: Collection[str] | None) -> None:
+    def __init__(self, recording: Recording, mcap: McapFile, wanted: Wanted) -> None:
         self._recording = recording
         self._mcap = mcap
-        self._topics = topics
+        self._wanted = wanted
+        wanted.begins([chunk.message_start_time for chunk in mcap.index.values() if chunk.message_end_time])
         self._streams: dict[int, Stream | None] = {}  # by channel; None: its messages are passed over
         self._undeclared: Counter[int] = Counter()
 
+    def holds_any(self, chunk: ChunkIndex) -> bool:
+        """Whether an indexed chunk may hold anything that is wanted."""
+        channels = {number: self._mcap.channels.get(number) for number in chunk.message_index_offsets}
+        if not channels or None in channels.values() or any(map(self._static, channels)):
+            return True
+        inside = self._wanted.overlaps(chunk.message_start_time, chunk.message_end_time)
+        for number, channel in channels.items():
+            if number not in self._streams:  # so that a topic is known, or listed as unread, wherever it is
+                self._streams[number] = self._open(channel)
+        return inside and any(self._streams[number] is not None for number in channels)
+
     def take(self, block: Block) -> None:
         """All messages of a block; declarations among them go to the file."""
-        entries: defaultdict[int, Entries] = defaultdict(list)
-        data, end, at = block.data, len(block.data), 0
-        while at + HEAD.size <= end:
-            opcode, length = HEAD.unpack_from(data, at)
-            start = at + HEAD.size
-            if start + length > end or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-                break
-            at = start + length
-            if opcode == Opcode.MESSAGE:
-                channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-                entries[channel].append((log_ns, start + _MESSAGE.size, at))
-            else:
-                self._mcap.declare(opcode, data[start:at])
-        if at < end and block.whole:
-            self._note(f"{end - at} bytes in the chunk at byte {block.chunk} are no records; skipped")
-        for channel, messages in entries.items():
+        channels, entries, others, at = walk(block.data)
+        self._wanted.begins(entries.log_ns)
+        for opcode, start, stop in others:
+            self._mcap.declare(opcode, block.data[start:stop])
+        if at < len(block.data) and block.whole:
+            self._note(f"{len(block.data) - at} bytes in the chunk at byte {block.chunk} are no records; skipped")
+        for channel in np.unique(channels).tolist():
+            messages = entries.select(channels == channel)
+            if self._wanted.window is not None and not self._static(channel):
+                messages = messages.select(self._wanted.inside(messages.log_ns))
             if channel not in self._mcap.channels:
-                self._undeclared[channel] += len(messages)
+                self._undeclared[channel] += len(messages.log_ns)
                 continue
-            self._recording.messages += len(messages)
+            if self._wanted.window is None or not self._static(channel):
+                self._recording.messages += len(messages.log_ns)
             if channel not in self._streams:
                 self._streams[channel] = self._open(self._mcap.channels[channel])
             stream = self._streams[channel]
@@ -175,12 +248,22 @@ class _Distributor:
     def _note(self, damage: str) -> None:
         self._mcap.damage.append(f"{self._mcap.name}: {damage}")
 
+    def _type(self, channel: Channel) -> str:
+        schema = self._mcap.schemas.get(channel.schema_id)
+        return full_name(schema.name) if schema else ""
+
+    def _static(self, number: int) -> bool:
+        """Whether a channel holds static transforms, which are always read: they come once, at the beginning."""
+        channel = self._mcap.channels[number]
+        return self._type(channel) == TRANSFORMS and channel.topic.endswith("tf_static")
+
     def _open(self, channel: Channel) -> Stream | None:
         """The stream for a channel."""
         schema = self._mcap.schemas.get(channel.schema_id)
-        topic, type = channel.topic, full_name(schema.name) if schema else ""
-        static = type == TRANSFORMS and topic.endswith("tf_static")
-        if self._topics is not None and topic not in self._topics and not static:
+        topic, type = channel.topic, self._type(channel)
+        static = self._static(channel.id)
+        if not static and not self._wanted.topic(topic):
+            self._recording.unread[topic] = type
             return None
         known = self._recording.streams.get(topic)
         if known:
@@ -195,7 +278,7 @@ class _Distributor:
         elif schema and schema.encoding not in _SCHEMA_ENCODINGS:
             unknown[topic] = f"{type} (schema encoding {schema.encoding!r})"
         elif type in LAYOUTS:
-            stream = SeriesStream(topic, type, LAYOUTS[type])
+            stream = SeriesStream(topic, type, LAYOUTS[type].without(self._wanted.leave))
         elif type == clouds.TYPE:
             stream = CloudStream(topic, type)
         elif static:

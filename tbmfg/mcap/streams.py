@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from tbmfg.mcap.clouds import McapClouds, Place, decode_cloud
 from tbmfg.mcap.container import Block
 from tbmfg.mcap.layouts import Layout, Rows, decode
+from tbmfg.mcap.records import Entries, gather
 from tbmfg.mcap.schemas import definition
 from tbmfg.mcap.stamps import misdated
 from tbmfg.timeseries import Floats, Series, StreamCounts, Times, Transform
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-Entries = list[tuple[int, int, int]]  # of messages in a block: log time, first and past-the-last byte
 
 _BATCH_BYTES = 2 << 20  # raw messages held back until they are decoded together
 _UNIT_NORM = 0.01  # a quaternion further than this from norm 1 was never filled in
@@ -34,7 +34,7 @@ class Stream:
 
     def take(self, block: Block, path: str, entries: Entries) -> None:
         """Messages ``entries`` of a block of the file ``path``."""
-        self._log_ns.append(np.array([entry[0] for entry in entries], dtype=np.uint64).astype(np.int64))
+        self._log_ns.append(entries.log_ns)
 
     def log_ns(self) -> Times:
         """Log times of all messages, in file order."""
@@ -51,21 +51,23 @@ class SeriesStream(Stream):
     def __init__(self, topic: str, type: str, layout: Layout) -> None:
         super().__init__(topic, type)
         self._layout = layout
-        self._payloads: list[bytes] = []
+        self._payloads: list[NDArray[np.uint8]] = []
+        self._sizes: list[Times] = []
         self._waiting = 0
         self._batches: list[Rows] = []
 
     def take(self, block: Block, path: str, entries: Entries) -> None:
         super().take(block, path, entries)
-        data = block.data
-        self._payloads += [data[start:stop] for _, start, stop in entries]
-        self._waiting += entries[-1][2] - entries[0][1]  # at most: other topics may lie in between
+        self._payloads.append(gather(block.data, entries))
+        self._sizes.append(entries.stop - entries.start)
+        self._waiting += len(self._payloads[-1])
         if self._waiting > _BATCH_BYTES:
             self._decode()
 
     def _decode(self) -> None:
-        self._batches.append(decode(self._layout, self._payloads))
-        self._payloads, self._waiting = [], 0
+        data, sizes = [np.empty(0, np.uint8), *self._payloads], [np.empty(0, np.int64), *self._sizes]
+        self._batches.append(decode(self._layout, np.concatenate(data), np.concatenate(sizes)))
+        self._payloads, self._sizes, self._waiting = [], [], 0
 
     def _rows(self) -> Rows:
         """All messages so far, as one batch."""
@@ -95,11 +97,13 @@ class SeriesStream(Stream):
                 finite &= _finite_rows(columns[name])
         wrong = misdated(*self.stamps(), eras)
         kept, counts = _in_time_order(rows.t_ns, finite, wrong, int((~rows.good).sum()))
+        if not np.array_equal(kept, np.arange(len(rows.t_ns))):  # else nothing needs to be copied
+            columns = {name: values[kept] for name, values in columns.items()}
         return Series(
             self.topic,
             self.type,
             rows.t_ns[kept],
-            {name: values[kept] for name, values in columns.items()},
+            columns,
             rows.strings.get("frame_id", ""),
             rows.strings.get("child_frame_id", ""),
             counts,
@@ -118,7 +122,7 @@ class CloudStream(Stream):
 
     def take(self, block: Block, path: str, entries: Entries) -> None:
         super().take(block, path, entries)
-        for _, start, stop in entries:
+        for start, stop in zip(entries.start.tolist(), entries.stop.tolist(), strict=True):
             try:
                 t_ns, frame_id, _ = decode_cloud(memoryview(block.data)[start:stop])
             except ValueError:
@@ -151,9 +155,9 @@ class TransformStream(Stream):
 
     def take(self, block: Block, path: str, entries: Entries) -> None:
         super().take(block, path, entries)
-        for _, start, stop in entries:
+        for payload in entries.payloads(block.data):
             try:
-                message = self._decoder(block.data[start:stop])
+                message = self._decoder(payload)
             except (struct.error, ValueError, IndexError, McapError):
                 self.undecodable += 1
                 continue

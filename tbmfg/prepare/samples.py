@@ -179,6 +179,7 @@ def absence(log: Log, kind: str, topic: str) -> str:
 def instead(log: Log, kind: str) -> str:
     """The topics of the log that a kind of sensor could be."""
     types = {topic: series.type for topic, series in log.series.items()} | dict.fromkeys(log.clouds, CLOUDS)
+    types |= log.unread
     alike = sorted(topic for topic, type in types.items() if guess_role(topic, type) == kind)
     return f"{kind} topics in the log: {', '.join(alike) or 'none'}"
 
