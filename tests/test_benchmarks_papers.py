@@ -4,14 +4,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import datasets
 from benchmarks.__main__ import main
-from benchmarks.papers import shearer
+from benchmarks.papers import sbm, shearer
 from benchmarks.papers.trials import Method, Outcome, Outcomes, confidence
 from benchmarks.rows import read_rows
+from benchmarks.runs import true_states
 from tbmfg.evaluation.metrics import chi_square_bounds
-from tbmfg.state import Innovations, Interval
+from tbmfg.geometry import matrix_from_quat
+from tbmfg.state import Innovations, Interval, Result, Trajectory
 from tests.test_datasets_sensors import assert_chi_square
 
 ERRORS = {"plain": [10.0, 12.0, 8.0, 11.0], "better": [4.0, 5.0, 3.5, 5.5], "best": [2.0, 2.5, 1.5, 2.0]}
@@ -177,6 +180,47 @@ def test_shearer_paper_runs(tmp_path, monkeypatch, capsys):
     yaw = {scenario: rows[scenario, "shearer-ckf", "rms_yaw"].mean for scenario in ("nominal", "offset")}
     assert yaw["offset"] > 2 * yaw["nominal"]
     assert "nees_pose@12s" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_shaft_machine_paper_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(sbm, "METHODS", (*(Method(name, name) for name in sbm.THREE), Method("batch", "batch")))
+    monkeypatch.setattr(sbm, "SCENARIOS", {"dynamic": ("shaft-dynamic", {}), "fast cage": ("cage-fast", {})})
+    out = tmp_path / "rows.json"
+    arguments = ["papers", "--paper", "sbm", "--seeds", "1", "--duration", "12", "--jobs", "1", "--json", str(out)]
+    assert main(arguments) == 0
+    rows = {row.key: row for row in read_rows(out)}
+    assert {key[0] for key in rows} == {"dynamic", "fast cage", "cost"}
+    assert all(row.mean == 0 for row in rows.values() if row.metric == "failed")
+    assert rows["dynamic", "sbm-cf", "yaw"].published == 3.52
+    assert rows["dynamic", "sbm-ekf", "yaw over sbm-cfekf"].published == pytest.approx(2.73 / 1.16)
+    assert rows["dynamic", "batch", "pitch over best filter"].bound[1] >= 0.5
+    assert rows["dynamic", "batch", "yaw over best filter"].bound[1] >= 1.0
+    assert rows["dynamic", "batch", "roll_true"].mean == pytest.approx(0.5, rel=0.4)  # not a whole period in 12 s
+    assert rows["fast cage", "sbm-cfekf", "speed"].published == 0.06
+    assert ("fast cage", "batch", "roll") not in rows
+    # two Kalman filter steps of 9 states against a handful of cross products, whatever the machine
+    assert rows["cost", "sbm-ekf", "per step over sbm-cf"].mean > 3
+
+
+def test_errors_of_the_shaft_machine_are_those_of_angles_detector_and_depth():
+    """An estimate that is wrong by a known amount: 1 degree of roll, 2 of pitch, 3 of yaw, 4 cm, 5 m and 6 m/s."""
+    simulation = datasets.make("shaft-descend", seed=1, duration=2.0, nominal=1)
+    t_ns = simulation.start_ns + np.arange(0, 2_000_000_000, 100_000_000)
+    truth = true_states(simulation, t_ns)
+    angles = sbm.angles_deg(matrix_from_quat(truth.quat_xyzw)) + np.array([3.0, 2.0, 1.0])
+    R = Rotation.from_euler("ZYX", angles, degrees=True)
+    detector = np.array([0.0, 0.0, 0.1])
+    held = truth.position_n + matrix_from_quat(truth.quat_xyzw) @ detector - R.as_matrix() @ detector
+    position = np.column_stack([held[:, :2] + [0.024, 0.032], truth.position_n[:, 2] - 5.0])
+    n = len(t_ns)
+    path = Trajectory(
+        t_ns, position, R.as_quat(), truth.velocity_n - [0, 0, 6.0], np.zeros((n, 3)), np.zeros((n, 3)),
+        np.zeros((n, 15, 15)),
+    )  # fmt: skip
+    found = sbm.errors(simulation, Result("ins", path), truth)
+    expected = {"roll": 1.0, "pitch": 2.0, "yaw": 3.0, "displacement": 4.0, "depth": 5.0, "speed": 6.0}
+    assert {name: value for name, (value, _) in found.items()} == pytest.approx(expected)
 
 
 def test_wrong_papers_and_numbers_are_refused(capsys):

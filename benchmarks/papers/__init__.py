@@ -23,6 +23,7 @@ from tbmfg.errors import TbmfgError
 
 PAPERS = {
     "shearer": "benchmarks.papers.shearer",
+    "sbm": "benchmarks.papers.sbm",
 }
 
 
