@@ -184,8 +184,8 @@ def test_shearer_paper_runs(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_shaft_machine_paper_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr(sbm, "METHODS", (*(Method(name, name) for name in sbm.THREE), Method("batch", "batch")))
-    monkeypatch.setattr(sbm, "SCENARIOS", {"dynamic": ("shaft-dynamic", {}), "fast cage": ("cage-fast", {})})
+    few = {"dynamic": ("shaft-dynamic", {}, sbm.FEW), "fast cage": ("cage-fast", {}, sbm.FEW)}
+    monkeypatch.setattr(sbm, "SCENARIOS", few)
     out = tmp_path / "rows.json"
     arguments = ["papers", "--paper", "sbm", "--seeds", "1", "--duration", "12", "--jobs", "1", "--json", str(out)]
     assert main(arguments) == 0
