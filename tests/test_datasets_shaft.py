@@ -7,13 +7,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 import datasets
 from datasets import cage, shaft
 from datasets.motion import Kinematics, Motion
 from datasets.sensors import shaft_pressure, spot_on_detector
 from datasets.simulate import stream
+from tests.test_datasets_sensors import assert_chi_square
 
 DETECTOR = np.diag([1.0, -1.0, -1.0])  # x forward, y right, z down in forward-left-up
 SHAFT = [name for name in datasets.MACHINES if name.startswith(("shaft", "cage"))]
@@ -30,12 +30,6 @@ def log_of(simulation, topic):
 
 def true_at(simulation, topic):
     return simulation.truth((log_of(simulation, topic).t_ns - simulation.start_ns) * 1e-9)
-
-
-def assert_chi_square(normalised):
-    """Independent standard normal values: their squares' sum lies in its central 99.8 %."""
-    low, high = chi2.ppf([0.001, 0.999], df=normalised.size)
-    assert low < np.sum(normalised**2) < high
 
 
 def pose(position=(0.0, 0.0, 0.0), roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
