@@ -18,5 +18,6 @@ from __future__ import annotations
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "speed": "benchmarks.speed",
+    "scale": "benchmarks.scale",
     "papers": "benchmarks.papers",
 }

@@ -33,6 +33,8 @@ from tbmfg.errors import TbmfgError
 from tbmfg.rig import Rig, load_rig, override
 from tbmfg.state import POS
 
+Clock = Callable[[], float]
+
 RECORDING = Path("mcap") / "euroc_mh01_imu_leica.mcap"
 LIMIT = 4.0  # a run should take at most this many times the script
 STAGES = {  # where tbmfg looks each of them up when it runs
@@ -130,33 +132,33 @@ def compare(path: Path, rig: Rig, repeat: int) -> list[Row]:
 
 
 @contextmanager
-def clocks(targets: dict[str, str]) -> Iterator[dict[str, float]]:
+def clocks(targets: dict[str, str], now: Clock = time.perf_counter) -> Iterator[dict[str, float]]:
     """Seconds spent in each of the named functions while inside, by the names' keys."""
     spent: dict[str, float] = dict.fromkeys(targets, 0.0)
     with ExitStack() as stack:
         for stage, target in targets.items():
-            stack.enter_context(mock.patch(target, clocked(spent, stage, pkgutil.resolve_name(target))))
+            stack.enter_context(mock.patch(target, clocked(spent, stage, pkgutil.resolve_name(target), now)))
         yield spent
 
 
-def clocked(spent: dict[str, float], stage: str, function: Callable) -> Callable:
+def clocked(spent: dict[str, float], stage: str, function: Callable, now: Clock) -> Callable:
     """``function``, its time added to ``spent``."""
 
     def wrapper(*args: Any, **kwargs: Any) -> Any:
-        with clock(spent, stage):
+        with clock(spent, stage, now):
             return function(*args, **kwargs)
 
     return wrapper
 
 
 @contextmanager
-def clock(spent: dict[str, float], stage: str) -> Iterator[None]:
+def clock(spent: dict[str, float], stage: str, now: Clock = time.perf_counter) -> Iterator[None]:
     """Add the time inside to ``spent``."""
-    started = time.perf_counter()
+    started = now()
     try:
         yield
     finally:
-        spent[stage] = spent.get(stage, 0.0) + time.perf_counter() - started
+        spent[stage] = spent.get(stage, 0.0) + now() - started
 
 
 # ---- decoding ----
