@@ -278,7 +278,8 @@ def test_a_browser_draws_it_without_complaint_and_without_a_network(tmp_path):
         [
             CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader",
             "--enable-unsafe-swiftshader", "--enable-logging=stderr", "--host-resolver-rules=MAP * ~NOTFOUND",
-            f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=20000", "--dump-dom",
+            f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,9000",
+            "--virtual-time-budget=20000", "--dump-dom",
             (tmp_path / "report.html").as_uri(),
         ],
         capture_output=True, text=True, timeout=120,

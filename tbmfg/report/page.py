@@ -49,15 +49,24 @@ figure { margin: 0; }
 }
 """
 
-# One figure after the other, so that the page answers meanwhile; nothing is ever sent anywhere.
+# One figure after the other, so that the page answers meanwhile, and the one in space when it is scrolled to: without a
+# graphics card it takes long. Nothing is ever sent anywhere.
 SCRIPT = """
 const waiting = JSON.parse(document.getElementById("figures").textContent);
 const options = {responsive: true, displaylogo: false, plotlyServerURL: "",
                  modeBarButtonsToRemove: ["sendChartToCloud", "select2d", "lasso2d"]};
 function draw(k) {
   if (k === waiting.length) { document.body.dataset.drawn = String(k); return; }
-  Plotly.newPlot("figure" + k, waiting[k].data, waiting[k].layout, options)
-    .then(() => setTimeout(draw, 0, k + 1));
+  const plot = document.getElementById("figure" + k), {data, layout} = waiting[k];
+  const next = () => setTimeout(draw, 0, k + 1);
+  if (!layout.scene) { Plotly.newPlot(plot, data, layout, options).then(next); return; }
+  const watch = new IntersectionObserver(seen => {
+    if (!seen.some(one => one.isIntersecting)) return;
+    watch.disconnect();
+    Plotly.newPlot(plot, data, layout, options);
+  });
+  watch.observe(plot);
+  next();
 }
 draw(0);
 function width(px) {
