@@ -5,7 +5,8 @@ up to several lengths (``--end``), each in a process of its own with one native 
 not count. Seconds are those of the processor, so that other work on the machine changes them little; on an idle machine
 they are those of the clock. Writing is included. Logs are estimated without their truth.
 
-read .. write            stages of ``tbmfg run``, in s and as multiples of real time; ``build`` is the preintegration
+read .. write            stages of ``tbmfg run``, in s and as multiples of real time; ``build`` is the preintegration,
+                         ``filter`` also counts the runs that ``prepare`` makes
 x real time              duration of the log over the seconds of the whole run
 peak_rss                 largest memory of the process
 growth of ..             exponent p of the fit a T^p over the lengths
