@@ -196,12 +196,27 @@ def barometer_rows(sensor: Barometer, heights: Samples, keyframes_s: Floats, ori
 
 def velocity_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], sigma: Floats) -> Rows:
     """Zero velocity at the keyframes inside ``intervals``; ``sigma`` (3,) m/s per axis of n."""
-    still = np.zeros(len(keyframes_s), dtype=bool)
-    for start, end in intervals:
-        still |= (keyframes_s >= start) & (keyframes_s <= end)
-    k = np.flatnonzero(still)
+    k = np.flatnonzero(_stretch_of(keyframes_s, intervals) >= 0)
     empty, zero = np.zeros((len(k), 0)), np.zeros((len(k), 3))
     return Rows("zero_velocity", "velocity", k, k, zero, empty, zero + sigma, slice(0, 0), np.ones(len(k), dtype=int))
+
+
+def rotation_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], walk: float, shaking: float) -> Rows:
+    """No turn between neighbouring keyframes inside one of ``intervals``, but for a random ``walk`` [rad/sqrt(s)] and
+    vibration of ``shaking`` rms [rad] per axis. A steady turn at the gyro's bias would look the same to the IMU."""
+    stretch = _stretch_of(keyframes_s, intervals)
+    i = np.flatnonzero((stretch[:-1] >= 0) & (stretch[:-1] == stretch[1:]))
+    sigma = np.sqrt(walk**2 * (keyframes_s[i + 1] - keyframes_s[i]) + 2.0 * shaking**2)
+    empty, ones = np.zeros((len(i), 0)), np.ones(len(i), dtype=int)
+    return Rows("zero_rotation", "rotation", i, i + 1, empty, empty, np.tile(sigma[:, None], 3), slice(0, 0), ones)
+
+
+def _stretch_of(t_s: Floats, intervals: list[tuple[float, float]]) -> np.ndarray:
+    """Number of the interval that each time lies in, -1 outside of all."""
+    found = np.full(len(t_s), -1)
+    for number, (start, end) in enumerate(intervals):
+        found[(t_s >= start) & (t_s <= end)] = number
+    return found
 
 
 def bounded_rows(keyframes_s: Floats, centre_n: Floats, radius: float, speed: float) -> Rows:

@@ -369,8 +369,10 @@ class ZeroVelocity(Node):
 
     enabled: Flag = Field(True, description="Off for machines that glide.")
     sigma_mps: Positive = Field(0.005, description="Of the velocity while standing, per axis.")
+    turn_deg_rts: Positive = Field(0.02, description="Random walk of the attitude while standing, deg/sqrt(s).")
 
     sigma = si("sigma_mps")
+    turn = si("turn_deg_rts", DEG)
 
 
 class Motion(Node):

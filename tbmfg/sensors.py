@@ -214,6 +214,17 @@ def velocity(z, data, xi, xj, c):
     return xi[:, 12:15] - z, Ji, np.zeros((n, 3, 0)), np.zeros((n, 3, 0))
 
 
+def rotation(z, data, xi, xj, c):
+    """No turn between two keyframes while the machine stands: r = Log(R_i^T R_j). z (0), data (0), c (0)."""
+    n, d = len(xi), xi.shape[1] - 6
+    R = xi[:, :9].reshape(n, 3, 3).swapaxes(1, 2) @ xj[:, :9].reshape(n, 3, 3)
+    turn = log_so3(R)
+    half = np.eye(3) + 0.5 * skew(turn) + skew(turn) @ skew(turn) / 12  # of Log, to the second order
+    Ji, Jj = np.zeros((n, 3, d)), np.zeros((n, 3, d))
+    Ji[:, :, :3], Jj[:, :, :3] = -half @ R.swapaxes(1, 2), half
+    return turn, Ji, Jj, np.zeros((n, 3, 0))
+
+
 @njit(cache=True)
 def bounded(z, data, xi, xj, c):
     """A body that stays near a place: z (6): centre in n [m], then zero velocity [m/s]."""
@@ -267,7 +278,7 @@ def lidar(z, data, xi, xj, c):
 
 
 MODELS: dict[str, Callable] = {
-    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, bounded, lidar)
+    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, rotation, bounded, lidar)
 }
 
 

@@ -292,6 +292,14 @@ def test_zero_velocity_inside_still_intervals_only():
     assert len(measure.velocity_rows(keyframes, [(0.1, 0.2)], np.ones(3))) == 0
 
 
+def test_zero_rotation_between_keyframes_of_one_stretch():
+    keyframes = np.arange(0.0, 10.0, 0.5)
+    rows = measure.rotation_rows(keyframes, [(0.9, 2.1), (2.4, 2.6), (7.0, 8.0)], walk=0.01, shaking=0.003)
+    assert_allclose(keyframes[rows.i], [1.0, 1.5, 7.0, 7.5])
+    assert_array_equal(rows.j, rows.i + 1)
+    assert_allclose(rows.sigma, np.sqrt(0.01**2 * 0.5 + 2 * 0.003**2))
+
+
 def test_bound_at_every_keyframe():
     rows = measure.bounded_rows(np.arange(4.0), np.array([1.0, 2.0, 3.0]), 0.5, 2.0)
     assert_allclose(rows.z[3], [1, 2, 3, 0, 0, 0])

@@ -11,10 +11,22 @@ from datasets.simulate import simulate
 from tbmfg.errors import EstimationError, LogError, RigError
 from tbmfg.estimators import estimate
 from tbmfg.geometry import log_so3
-from tbmfg.prepare import prepare
+from tbmfg.inertial.alignment import still_intervals
+from tbmfg.inertial.steps import make_steps
+from tbmfg.prepare import prepare, rest
 from tbmfg.rig import override, parse_rig
 from tbmfg.timeseries import NS
-from tests.problems import FLIGHT_RIG, drive, flight, flight_path, log_of, state_errors, true_rig, true_states
+from tests.problems import (
+    FLIGHT_RIG,
+    drive,
+    flight,
+    flight_path,
+    imu_series,
+    log_of,
+    state_errors,
+    true_rig,
+    true_states,
+)
 
 
 def prepared(simulation, *settings, **options):
@@ -225,6 +237,19 @@ def test_constant_speed_is_not_taken_for_rest():
         moving.append(series)
     assert not any(rows.sensor == "zero_velocity" for rows in prepare(log_of(moving), simulation.rig).rows)
     assert any(rows.sensor == "zero_velocity" for rows in prepared(simulation).rows)
+
+
+def test_steady_turn_is_no_rest():
+    """A platform that turns at a steady rate looks still to its IMU, and a prism on its axis does not move."""
+    rate = np.zeros((6000, 3))
+    rate[2000:3000, 2] = 0.02  # 5 s at 1.1 deg/s, between two rests at 200 Hz
+    gyro = rate + np.array([0.01, -0.02, 0.005]) + 1e-4 * np.random.default_rng(0).standard_normal(rate.shape)
+    steps = make_steps(imu_series(gyro, np.tile([0.0, 0.0, 9.81], (6000, 1))), np.eye(3), "end")
+    still = still_intervals(steps)
+    kept = rest._unturning(steps, still)
+    assert any(a < 12.0 < b for a, b in still)
+    assert kept == [s for s in still if not s[0] < 12.0 < s[1]]
+    assert len(kept) >= 2
 
 
 def test_zero_velocity_may_be_turned_off():

@@ -69,7 +69,7 @@ def tolerance(model):
 
 
 def test_every_model_is_tested():
-    assert set(CASES) == set(MODELS)
+    assert {*CASES, "rotation", "lidar"} == set(MODELS)  # the last has a file of its own
 
 
 @pytest.mark.parametrize("model", CASES)
@@ -265,3 +265,22 @@ def test_rows_take_their_states_and_calibrations_and_whiten():
     one = rows.evaluate_at(x[2:3], x[3:4], calibrations, slice(1, 2))
     assert_array_equal(one[0], whitened[0][1:])
     assert (len(rows), rows.dof) == (2, 3)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+def test_rotation_while_standing(size):
+    turn = size * np.array([0.6, -0.64, 0.48])
+    x_j = correct_state(X_I, np.concatenate([turn, np.zeros(15 + DRIFTS - 3)]))
+    row = [np.zeros((1, 0))] * 2
+    r, Ji, Jj, Jc = (part[0] for part in MODELS["rotation"](*row, X_I[None], x_j[None], np.zeros(0)))
+    assert_allclose(r, turn, atol=1e-12)
+    assert Jc.size == 0
+
+    def at(d, side):
+        xi, xj = (correct_state(X_I, d), x_j) if side == "i" else (X_I, correct_state(x_j, d))
+        return MODELS["rotation"](*row, xi[None], xj[None], np.zeros(0))[0][0]
+
+    # the series of the inverse Jacobian of Exp ends before turn^4 / 720
+    bound = size**4 / 720 + 2 * (STEP**2 / 6 + EPS / STEP)
+    for J, side in ((Ji, "i"), (Jj, "j")):
+        assert_allclose(J, differences(lambda d, side=side: at(d, side), J.shape[1]), atol=bound)

@@ -60,7 +60,10 @@ def prepare(
     problem.intervals = [
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
-        *(Interval("zero_velocity", "standing", *(int(t) for t in to_ns(steps, np.array(s)))) for s in setup.still),
+        *(
+            Interval("zero_velocity", "standing", *(int(t) for t in to_ns(steps, np.array(s))))
+            for s in setup.standing.intervals
+        ),
     ]
     tell("prepare", 1.0)
     return problem

@@ -56,12 +56,15 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
             drift_walk.append(sensor.bias_walk)
             drift_sd.append(max(sensor.bias_sd, 1e-6))
             drift_start.append(float(np.median(s.values[:20])))
-    if setup.still:
-        rows.append(measure.velocity_rows(keyframes, setup.still, setup.still_sigma))
+    if (standing := setup.standing).intervals:
+        speed = np.hypot(rig.zero_velocity.sigma, standing.speed)
+        rows.append(measure.velocity_rows(keyframes, standing.intervals, np.full(3, speed)))
+        turned = measure.rotation_rows(keyframes, standing.intervals, rig.zero_velocity.turn, standing.angle)
+        rows += [turned] if len(turned) else []
     position, velocity = first_state(setup, offsets)
     if rig.motion is not None:
         rows.append(measure.bounded_rows(keyframes, position, rig.motion.radius, rig.motion.speed))
-    if not any(kind_of(r.sensor) != "zero_velocity" for r in rows):
+    if not any(kind_of(r.sensor) not in ("zero_velocity", "zero_rotation") for r in rows):
         raise EstimationError(ALONE)
 
     imu = rig.imu

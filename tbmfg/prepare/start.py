@@ -11,6 +11,8 @@ from tbmfg.geometry import rotation_from_rpy, rotation_z, wrap, yaw_of
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps, compensate
 from tbmfg.measure import GyroFrame, Samples, gyro_frame
+from tbmfg.prepare import rest
+from tbmfg.prepare.rest import Rest
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import Parameters
 from tbmfg.rig import Lidar, Magnetometer, Odometer, PositionSensor, Rig
@@ -37,8 +39,7 @@ class Setup:
     R_start: Floats
     yaw_sd: float
     gyrocompassed: bool
-    still: list[tuple[float, float]]
-    still_sigma: Floats
+    standing: Rest
     bias_gyro: Floats
     origin_n: Floats
     counts: dict[str, Counts]
@@ -92,12 +93,11 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
     else:
         warnings.append("heading is a guess: no magnetometer, no position sensor, no initial.yaw_deg; it is set to 0")
 
-    confirmed = _confirmed_rest(rig, samples, still) if rig.zero_velocity.enabled else []
-    sigma = np.hypot(rig.zero_velocity.sigma, _vibration_speed(steps, confirmed))
+    standing = rest.find(rig, samples, steps, still) if rig.zero_velocity.enabled else rest.NONE
     origin_n = np.round(np.median(position.values[:50], axis=0)) if position is not None else np.zeros(3)
     return Setup(
-        rig, steps, frame, gyro, acc, samples, parameters_of(rig, samples), R_start, yaw_sd, gyrocompassed, confirmed,
-        np.full(3, sigma), bias_gyro, origin_n, counts, warnings,
+        rig, steps, frame, gyro, acc, samples, parameters_of(rig, samples), R_start, yaw_sd, gyrocompassed, standing,
+        bias_gyro, origin_n, counts, warnings,
     )  # fmt: skip
 
 
@@ -171,51 +171,6 @@ def _course_heading(
     S = np.stack([np.interp(fixes, t, way[:, axis]) for axis in range(3)], axis=1)
     S = (S + frame.at(fixes) @ (point.arm - odometer.arm)) @ R_level.T
     return alignment.turn_between(S - S.mean(axis=0), z - z.mean(axis=0), COURSE_SD)
-
-
-def _confirmed_rest(
-    rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]
-) -> list[tuple[float, float]]:
-    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
-    confirmed = []
-    for start, end in still:
-        for name, s in samples.items():
-            sensor = rig.sensors[name]
-            t = s.t_s - getattr(sensor, "clock_offset", 0.0)
-            rows = (t >= start) & (t <= end)
-            if rows.sum() < 3:
-                continue
-            values = s.values[rows]
-            if isinstance(sensor, PositionSensor):
-                spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
-                resting = bool(np.all(spread < 5.0 * s.sigma[rows].max(axis=1)))
-            elif isinstance(sensor, Odometer):
-                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
-            else:
-                continue
-            # the stamps' offset may be unknown: leave its spread free on either side
-            margin = 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
-            first, last = float(t[rows][0]) + margin, float(t[rows][-1]) - margin
-            if resting and last > first:
-                confirmed.append((first, last))
-            break
-    return confirmed
-
-
-def _vibration_speed(steps: Steps, intervals: list[tuple[float, float]]) -> float:
-    """RMS of the vibration's velocity per axis [m/s] while standing: what a zero velocity must allow for."""
-    squares = []
-    for start, end in intervals:
-        rows = alignment.rows_between(steps, start, min(end, start + 10.0))
-        force = steps.acc[rows]
-        if len(force) < 10:
-            continue
-        v = np.cumsum((force - force.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
-        # drift of the mean over a second is no vibration
-        size = max(1, round(1.0 / steps.period_s))
-        smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
-        squares.append(np.mean((v - smooth)[size:-size] ** 2) if len(v) > 3 * size else np.mean((v - smooth) ** 2))
-    return float(np.sqrt(np.mean(squares))) if squares else 0.0
 
 
 def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:

@@ -28,6 +28,7 @@ PARTS = {
     "barometer": ("XVD", ""),
     "bounded": ("XV", ""),
     "lidar": ("XV", "XV"),
+    "rotation": ("X", "X"),
 }
 SYMBOLS = {"X": X, "V": V, "B": B, "D": D}
 BLOCKS = {"X": slice(0, 6), "V": VEL, "B": BIAS, "D": slice(NAV, None)}

@@ -1,0 +1,89 @@
+"""Where the machine stands, and how much it shakes there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tbmfg.inertial import alignment
+from tbmfg.inertial.steps import Steps
+from tbmfg.measure import Samples
+from tbmfg.rig import Odometer, PositionSensor, Rig
+from tbmfg.timeseries import Floats
+
+# rad/s: a mean rate that differs by more from that of the other still stretches is a steady turn, no bias: 0.06 deg/s
+TURNING = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """Stretches (start, end) in s in which the machine stands, and the vibration there: rms of its speed [m/s] and of
+    its angle [rad], per axis."""
+
+    intervals: list[tuple[float, float]]
+    speed: float
+    angle: float
+
+
+NONE = Rest([], 0.0, 0.0)
+
+
+def find(rig: Rig, samples: dict[str, Samples], steps: Steps, still: list[tuple[float, float]]) -> Rest:
+    """Rest in those of the inertially ``still`` stretches that nothing contradicts."""
+    confirmed = _confirmed(rig, samples, _unturning(steps, still))
+    return Rest(confirmed, *(_vibration(steps, signal, confirmed) for signal in (steps.acc, steps.gyro)))
+
+
+def _unturning(steps: Steps, still: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Stretches without those of a steady turn: their mean rate is not what the gyro shows in most of the others."""
+    if not still:
+        return []
+    rates = np.array([steps.gyro[alignment.rows_between(steps, *stretch)].mean(axis=0) for stretch in still])
+    weight = np.maximum(np.round([end - start for start, end in still]), 1).astype(int)
+    usual = np.median(np.repeat(rates, weight, axis=0), axis=0)
+    return [s for s, rate in zip(still, rates, strict=True) if np.linalg.norm(rate - usual) < TURNING]
+
+
+def _confirmed(rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
+    confirmed = []
+    for start, end in still:
+        for name, s in samples.items():
+            sensor = rig.sensors[name]
+            t = s.t_s - getattr(sensor, "clock_offset", 0.0)
+            rows = (t >= start) & (t <= end)
+            if rows.sum() < 3:
+                continue
+            values = s.values[rows]
+            if isinstance(sensor, PositionSensor):
+                spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
+                resting = bool(np.all(spread < 5.0 * s.sigma[rows].max(axis=1)))
+            elif isinstance(sensor, Odometer):
+                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
+            else:
+                continue
+            # the stamps' offset may be unknown: leave its spread free on either side
+            margin = 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
+            first, last = float(t[rows][0]) + margin, float(t[rows][-1]) - margin
+            if resting and last > first:
+                confirmed.append((first, last))
+            break
+    return confirmed
+
+
+def _vibration(steps: Steps, signal: Floats, intervals: list[tuple[float, float]]) -> float:
+    """RMS per axis of the integral of ``signal`` (n, 3), specific force or rate, while standing: what a standing
+    machine's speed or attitude must be allowed."""
+    squares = []
+    for start, end in intervals:
+        rows = alignment.rows_between(steps, start, min(end, start + 10.0))
+        part = signal[rows]
+        if len(part) < 10:
+            continue
+        v = np.cumsum((part - part.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
+        # drift of the mean over a second is no vibration
+        size = max(1, round(1.0 / steps.period_s))
+        smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
+        squares.append(np.mean((v - smooth)[size:-size] ** 2) if len(v) > 3 * size else np.mean((v - smooth) ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
