@@ -19,6 +19,7 @@ from tbmfg.errors import LogError
 from tbmfg.evaluation.metrics import evaluate
 from tbmfg.geometry import exp_so3, quat_from_matrix
 from tbmfg.mcap import read_log, write_into, write_log, write_trajectory
+from tbmfg.mcap.info import guess_role
 from tbmfg.results import write_tum
 from tbmfg.state import NAV, Interval, Trajectory, Truth
 from tbmfg.timeseries import Series, Transform
@@ -173,6 +174,7 @@ def test_a_copy_keeps_every_message_and_adds_the_poses(tmp_path):
     copy = read_log(tmp_path / "copy.mcap")
     assert copy.attachments == {"rig.yaml": b"name: x"}
     np.testing.assert_array_equal(copy.series["/tbmfg/odometry"]["position"], trajectory(30).position_n)
+    assert guess_role("/tbmfg/odometry", "nav_msgs/msg/Odometry") == "unknown"  # it is no odometer of the machine
 
 
 def test_a_folder_of_files_becomes_one(tmp_path):

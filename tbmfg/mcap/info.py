@@ -88,6 +88,8 @@ def guess_role(topic: str, type: str) -> str:
 
     One of imu, prism, laser, odometer, magnetometer, barometer, gnss, lidar, truth, transforms.
     """
+    if topic.startswith("/tbmfg/"):
+        return "unknown"  # an estimate of ours in a copy of a log measures nothing
     kind, name = type.rpartition("/")[2], topic.lower().replace("_", "")
     if kind in _POSES and any(word in name for word in _TRUTH_NAMES):
         return "truth"
