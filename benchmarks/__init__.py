@@ -19,5 +19,6 @@ BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
+    "lidar": "benchmarks.lidar",
     "papers": "benchmarks.papers",
 }

@@ -10,6 +10,7 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -227,6 +228,26 @@ def batch(
         _print_batch(report, output)
     if report[many.FAILED]:
         raise typer.Exit(1)
+
+
+@app.command("map")
+def map_(
+    log: Log,
+    trajectory: Annotated[str, typer.Option(metavar="DIR", help="Folder of a result of `tbmfg run`.")],
+    output: Annotated[str, typer.Option("--output", "-o", metavar="FILE", help="The .ply or .pcd to write.")],
+    lidar: Annotated[str | None, typer.Option(metavar="NAME", help="Which LiDAR of the rig; else the first.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Make the map of a log's LiDAR scans along an estimated trajectory, and a picture of it."""
+    with _errors_in_one_line(debug):
+        from tbmfg import mapping
+
+        with _progress_bar("mapping") as progress:
+            sharp, points = mapping.make(log, trajectory, output, lidar=lidar, force=force, progress=progress)
+        typer.echo(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
+        typer.echo(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
+        typer.echo(f"map: {output}, picture: {Path(output).with_suffix('.png')}")
 
 
 @app.command()

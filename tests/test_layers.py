@@ -24,7 +24,7 @@ LEVELS = (
     ("prepare",),
     ("estimators", "bounds", "report"),
     ("pipeline",),
-    ("batch", "api"),
+    ("batch", "api", "mapping"),
     ("cli",),
     ("__main__",),
 )

@@ -21,11 +21,11 @@ class SurfelMap:
     """Planes of ``voxel`` m in the frame of the points added.
 
     Columns of ``surfels``: mean (3), normal (3), the two axes in the plane (6), variances along the three (3, least
-    first), points (1); variances are zero where a voxel holds no plane.
+    first), points (1); variances are zero where a voxel holds no plane. A voxel takes no more than ``full`` points.
     """
 
-    def __init__(self, voxel: float) -> None:
-        self.voxel = voxel
+    def __init__(self, voxel: float, full: float = FULL) -> None:
+        self.voxel, self.full = voxel, float(full)
         self.keys = np.full(1 << 14, EMPTY)
         self.moments = np.zeros((len(self.keys), 10))
         self.surfels = np.zeros((len(self.keys), 16))
@@ -35,7 +35,7 @@ class SurfelMap:
         """Add points (n, 3) m."""
         while self.used + len(points) > len(self.keys) // 2:
             self._resize(np.ones(len(self.keys), dtype=bool), 2 * len(self.keys))
-        rows, used = _add(points, self.voxel, self.keys, self.moments)
+        rows, used = _add(points, self.voxel, self.full, self.keys, self.moments)
         self.used += used
         rows = np.unique(rows)
         self.surfels[rows] = planes_of(self.moments[rows], self.voxel)
@@ -45,6 +45,10 @@ class SurfelMap:
         filled = self.moments[:, 0] > 0
         mean = self.moments[:, 1:4] / np.maximum(self.moments[:, :1], 1.0)
         self._resize(filled & (np.sum((mean - centre) ** 2, axis=1) < radius**2), len(self.keys))
+
+    def covariances(self, least: int) -> Floats:
+        """Of the points in every voxel that holds ``least``, (n, 3, 3) m^2."""
+        return _spread(self.moments[self.moments[:, 0] >= least], self.voxel)[1]
 
     def _resize(self, keep: np.ndarray, size: int) -> None:
         old = self.keys, self.moments, self.surfels
@@ -83,7 +87,7 @@ def _refill(keep, old_keys, old_moments, old_surfels, keys, moments, surfels):
 
 
 @njit(cache=True)
-def _add(points, voxel, keys, moments):
+def _add(points, voxel, full, keys, moments):
     """Sums of 1, p, and d d' by voxel, d counted from the voxel's corner; the rows touched, and how many are new."""
     used, count, touched = 0, 0, np.empty(len(points), np.int64)
     d = np.empty(3)
@@ -94,7 +98,7 @@ def _add(points, voxel, keys, moments):
             keys[row] = key
             used += 1
         m = moments[row]
-        if m[0] >= FULL:
+        if m[0] >= full:
             continue
         m[0] += 1.0
         at = 4
@@ -113,15 +117,22 @@ def _add(points, voxel, keys, moments):
 def planes_of(moments: Floats, voxel: float) -> Floats:
     """Planes (n, 16) of voxels from their sums (n, 10)."""
     count = moments[:, :1]
+    mean, cov = _spread(moments, voxel)
+    value, vector = np.linalg.eigh(cov)
+    flat = (count[:, 0] >= LEAST) & (value[:, 1] > (WIDE * voxel) ** 2) & (value[:, 0] < FLAT * value[:, 1])
+    variance = np.where(flat[:, None], np.maximum(value, 1e-10), 0.0)
+    return np.hstack([mean, vector.swapaxes(1, 2).reshape(-1, 9), variance, count])
+
+
+def _spread(moments: Floats, voxel: float) -> tuple[Floats, Floats]:
+    """Means (n, 3) and covariances (n, 3, 3) from the sums (n, 10) of voxels."""
+    count = moments[:, :1]
     mean = moments[:, 1:4] / count
     d = mean - np.floor(mean / voxel) * voxel
     rows, columns = np.triu_indices(3)
     cov = np.empty((len(moments), 3, 3))
     cov[:, rows, columns] = cov[:, columns, rows] = moments[:, 4:] / count - d[:, rows] * d[:, columns]
-    value, vector = np.linalg.eigh(cov)
-    flat = (count[:, 0] >= LEAST) & (value[:, 1] > (WIDE * voxel) ** 2) & (value[:, 0] < FLAT * value[:, 1])
-    variance = np.where(flat[:, None], np.maximum(value, 1e-10), 0.0)
-    return np.hstack([mean, vector.swapaxes(1, 2).reshape(-1, 9), variance, count])
+    return mean, cov
 
 
 @njit(cache=True)

@@ -1,0 +1,141 @@
+"""The map that a log's LiDAR scans make along an estimated trajectory, and how sharp it is."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from tbmfg.errors import TbmfgError
+from tbmfg.inertial.steps import compensate
+from tbmfg.lidar import clouds, raster
+from tbmfg.lidar.surfels import SurfelMap
+from tbmfg.mcap import read_log
+from tbmfg.measure import gyro_frame
+from tbmfg.pipeline import rig_for
+from tbmfg.prepare.samples import imu_steps
+from tbmfg.results import read_result_npz, refuse_existing_file
+from tbmfg.rig import Lidar, Rig
+from tbmfg.state import Trajectory
+from tbmfg.timeseries import Floats, Log, seconds
+
+FORMATS = (".ply", ".pcd")
+MANY = 20  # scans that are thinned at once
+VOXEL_M = 0.05
+THICK_M = 0.25  # voxels that the sharpness is judged in
+LEAST = 20  # points of such a voxel
+NORMAL_M = 0.3  # neighbourhood of a normal
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """How sharp a map is: ``thickness_m``, the median sd of the points across the surface in a voxel of 0.25 m, and
+    ``entropy``, the mean of ln det(2 pi e C) / 2 over the same voxels (Droeschel, Behnke 2014). Ghosts raise both."""
+
+    thickness_m: float
+    entropy: float
+    voxels: int
+
+
+def make(
+    log_path: str,
+    trajectory: str | Path,
+    output: str | Path,
+    *,
+    lidar: str | None = None,
+    force: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> tuple[Sharpness, int]:
+    """Write the map of ``log_path`` along the result in the folder ``trajectory`` to ``output`` (.ply or .pcd), and its
+    picture beside it (.png); returns its sharpness and its number of points. Scans are read one by one."""
+    output, folder = Path(output), Path(trajectory)
+    if output.suffix not in FORMATS:
+        raise TbmfgError(f"{output}: a map ends in {' or '.join(FORMATS)}")
+    for file in (output, output.with_suffix(".png")):
+        refuse_existing_file(file, force)
+    log = read_log(log_path)
+    rig, _ = rig_for(log, str(folder / "rig.yaml"))
+    path = read_result_npz(folder / "result.npz")
+    o3d = open3d()
+    blur, cloud, waiting = SurfelMap(THICK_M, full=np.inf), o3d.geometry.PointCloud(), []
+    for number, (share, points_n) in enumerate(scans_in_n(log, rig, path, lidar)):
+        blur.add(points_n)
+        waiting.append(points_n)
+        if len(waiting) == MANY:
+            cloud, waiting = _thinned(o3d, cloud, waiting), []
+        if progress and number % 10 == 0:
+            progress("mapping", share)
+    cloud = _thinned(o3d, cloud, waiting)
+    if not len(cloud.points):
+        raise TbmfgError(f"{log_path}: no scan lies within the trajectory of {folder}")
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=NORMAL_M, max_nn=30))
+    scratch = output.with_name(f".{output.stem}.part{output.suffix}")
+    o3d.io.write_point_cloud(str(scratch), cloud)
+    scratch.replace(output)
+    points = np.asarray(cloud.points)
+    output.with_suffix(".png").write_bytes(raster.png(raster.picture(points, path.position_n)))
+    return sharpness(blur), len(points)
+
+
+def scans_in_n(log: Log, rig: Rig, path: Trajectory, name: str | None = None) -> Iterator[tuple[float, Floats]]:
+    """Share of the log done, and the points (k, 3) in n of one LiDAR's scans, each from its own pose.
+
+    Attitude between keyframes by gyro, position by the cubic through positions and velocities.
+    """
+    lidars = {n: s for n, s in rig.of_kind("lidar").items() if s.topic in log.clouds}
+    if not lidars or (name is not None and name not in lidars):
+        raise TbmfgError(f"{log.path}: no scans of {name or 'a lidar'}; the rig has {', '.join(lidars) or 'none'} here")
+    sensor: Lidar = lidars[name or next(iter(lidars))]
+    source = log.clouds[sensor.topic]
+    steps, _ = imu_steps(log, rig, (), [])
+    bias = path.bias_gyro.mean(axis=0)
+    frame = gyro_frame(steps, compensate(steps, bias, np.zeros(3))[0], bias)
+    key_s = seconds(path.t_ns, steps.t0_ns)
+    track = CubicHermiteSpline(key_s, path.position_n, path.velocity_n)
+    R_n0 = path.rotations() @ frame.at(key_s).swapaxes(1, 2)
+    stamps_s = seconds(source.t_ns, steps.t0_ns) - sensor.clock_offset
+    period_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.1
+    for k, (t_ns, fields) in enumerate(source):
+        scan = clouds.read(t_ns, fields, sensor, period_s)
+        t_s = stamps_s[k] + (np.zeros(len(scan.points)) if scan.after_s is None else scan.after_s)
+        inside = (t_s >= key_s[0]) & (t_s <= key_s[-1])
+        if not inside.any():
+            continue
+        own_s, which = np.unique(t_s[inside], return_inverse=True)
+        key = np.clip(np.searchsorted(key_s, own_s, side="right") - 1, 0, len(key_s) - 1)
+        R = R_n0[key] @ frame.at(own_s)
+        body = scan.points[inside] @ sensor.T_bl.R.T + sensor.T_bl.xyz
+        yield k / len(source), (R[which] @ body[:, :, None])[:, :, 0] + track(own_s)[which]
+
+
+def _thinned(o3d, cloud, scans: list[Floats]):
+    """``cloud`` with more scans in it, one point a voxel."""
+    if not scans:
+        return cloud
+    cloud.points.extend(o3d.utility.Vector3dVector(np.concatenate(scans)))
+    return cloud.voxel_down_sample(VOXEL_M)
+
+
+def sharpness(blur: SurfelMap) -> Sharpness:
+    """Of the points in a map that took them all; voxels that hold a surface, thick or thin, count alike."""
+    cov = blur.covariances(LEAST)
+    value = np.linalg.eigvalsh(cov)
+    value = np.maximum(value[value[:, 1] > (0.15 * blur.voxel) ** 2], 1e-12)
+    if not len(value):
+        raise TbmfgError("the map is too thin to judge: no voxel of 0.25 m holds a surface")
+    entropy = 0.5 * np.sum(np.log(2 * np.pi * np.e * value), axis=1)
+    return Sharpness(float(np.median(np.sqrt(value[:, 0]))), float(entropy.mean()), len(value))
+
+
+def open3d():
+    """Open3D. It wants libusb, which a bare machine lacks: the wheel's own is loaded first."""
+    import libusb_package
+
+    ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+    import open3d
+
+    return open3d

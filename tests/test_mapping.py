@@ -1,0 +1,92 @@
+"""The map: where its surfaces lie, its files and picture, and that ghosts show in its sharpness."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import datasets
+from benchmarks.runs import true_states
+from tbmfg import mapping
+from tbmfg.errors import TbmfgError
+from tbmfg.lidar import raster
+from tbmfg.mcap import read_log
+from tbmfg.rig import load_rig
+from tbmfg.state import Trajectory
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, Path]:
+    """A log of a roadway, and a result folder that holds its truth."""
+    folder = tmp_path_factory.mktemp("map")
+    simulation = datasets.make("tbm-roadway", seed=3, duration=6.0, columns=200, imu_rate_hz=200.0)
+    simulation.write(folder / "log.mcap")
+    save(folder / "truth", truth_path(simulation), simulation.rig_text)
+    return folder / "log.mcap", folder / "truth"
+
+
+def truth_path(simulation) -> Trajectory:
+    t_ns = simulation.start_ns + np.arange(0, 6_000_000_001, 100_000_000)
+    truth, zero = true_states(simulation, t_ns), np.zeros((61, 3))
+    return Trajectory(t_ns, truth.position_n, truth.quat_xyzw, truth.velocity_n, zero, zero, np.zeros((61, 15, 15)))
+
+
+def save(folder: Path, path: Trajectory, rig: str) -> None:
+    folder.mkdir()
+    np.savez(folder / "result.npz", **{name: getattr(path, name) for name in Trajectory.__slots__})
+    (folder / "rig.yaml").write_text(rig)
+
+
+def test_map_along_the_truth(made, tmp_path):
+    log, folder = made
+    sharp, count = mapping.make(str(log), folder, tmp_path / "map.ply")
+    cloud = mapping.open3d().io.read_point_cloud(str(tmp_path / "map.ply"))
+    points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
+    assert len(points) == len(normals) == count > 5000
+    # range noise is 30 mm along the ray; a wall seen at a slant is thinner
+    assert 0.01 < sharp.thickness_m < 0.04
+    picture = (tmp_path / "map.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    with pytest.raises(TbmfgError, match="--force"):
+        mapping.make(str(log), folder, tmp_path / "map.ply")
+
+
+def test_ghosts_show(made, tmp_path):
+    log, folder = made
+    read = read_log(log)
+    path, rig = mapping.read_result_npz(folder / "result.npz"), load_rig(folder / "rig.yaml")
+    sharp = []
+    for shift in (0.0, 0.15):
+        drifting = path.position_n + shift * np.linspace(0, 1, 61)[:, None] * [0.0, 1.0, 1.0]
+        blur = mapping.SurfelMap(mapping.THICK_M, full=np.inf)
+        for _, points in mapping.scans_in_n(read, rig, replace(path, position_n=drifting)):
+            blur.add(points)
+        sharp.append(mapping.sharpness(blur))
+    assert sharp[1].thickness_m > 1.3 * sharp[0].thickness_m
+    assert sharp[1].entropy > sharp[0].entropy + 0.2
+
+
+def test_what_cannot_be_mapped(made, tmp_path):
+    log, folder = made
+    with pytest.raises(TbmfgError, match=r"\.ply or \.pcd"):
+        mapping.make(str(log), folder, tmp_path / "map.xyz")
+    with pytest.raises(TbmfgError, match="no scans of lidar-2"):
+        mapping.make(str(log), folder, tmp_path / "map.ply", lidar="lidar-2")
+    assert not list(tmp_path.iterdir())
+
+
+def test_picture_holds_the_points_and_the_path():
+    points = np.array([[0.0, 0.0, 0.0], [10.0, 1.0, 0.0], [10.0, 0.0, 2.0]])
+    image = raster.picture(points, np.array([[0.0, 0.5, 1.0], [10.0, 0.5, 1.0]]))
+    assert image.shape[1:] == (raster.WIDTH, 3)
+    assert (image == raster.PATH).all(axis=2).sum() >= 2 * raster.WIDTH - 2
+    data = raster.png(image)
+    assert struct.unpack(">II", data[16:24]) == (raster.WIDTH, len(image))
+    start = data.index(b"IDAT") + 4
+    rows = zlib.decompress(data[start : data.index(b"IEND") - 8])
+    assert len(rows) == len(image) * (3 * raster.WIDTH + 1)
