@@ -24,6 +24,7 @@ LEAST_POINTS = 100  # of a scan that can be registered
 FITS = 0.5  # least share of the points near planes that lie on them; below, the scan is not believed
 LOST = 20  # such scans in a row after which the map begins anew
 NEAREST_SD = (2e-4, 1e-3)  # rad and m: no scan is known better than this, whatever its many points say
+ROUGHLY = 2e-3, 50  # KISS-ICP need not settle to the micrometre where planes take over: step and iterations
 FORGET_EVERY = 50  # scans after which what is out of range is forgotten
 
 
@@ -58,6 +59,7 @@ class Odometry:
         config = load_config(None)
         config.mapping.voxel_size = sensor.voxel
         config.data.max_range, config.data.min_range = sensor.max_range, sensor.min_range
+        config.registration.convergence_criterion, config.registration.max_num_iterations = ROUGHLY
         self.sensor, self.motion = sensor, motion
         self.kiss = KissICP(config)
         self.planes = SurfelMap(sensor.voxel)

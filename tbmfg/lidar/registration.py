@@ -25,7 +25,7 @@ KERNEL = 2.0  # sds at which a distance has a quarter of its weight
 ON = 0.2  # largest distance of a point on a plane, in voxels
 LEAST_NEAR = 30  # points near planes that can be registered
 ITERATIONS = 12
-STILL = 1e-4  # m and rad: a step that ends the iteration
+STILL = 3e-4  # m and rad: a step that ends the iteration
 
 
 @dataclass(frozen=True, slots=True)

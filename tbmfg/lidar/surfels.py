@@ -13,6 +13,7 @@ from tbmfg.timeseries import Floats
 LEAST = 6  # points of a plane
 FLAT = 0.1  # largest ratio of a plane's variance across to its smaller one along: sd 0.3
 WIDE = 0.1  # least sd along a plane, in voxels
+GROWN = 1.2  # times its points after which a plane is fitted anew
 FULL = 100  # points after which a voxel takes no more: the map stands still
 EMPTY = np.int64(-(2**62))
 
@@ -38,6 +39,7 @@ class SurfelMap:
         rows, used = _add(points, self.voxel, self.full, self.keys, self.moments)
         self.used += used
         rows = np.unique(rows)
+        rows = rows[self.moments[rows, 0] >= GROWN * self.surfels[rows, 15]]
         self.surfels[rows] = planes_of(self.moments[rows], self.voxel)
 
     def keep_near(self, centre: Floats, radius: float) -> None:
