@@ -117,13 +117,14 @@ def kiss_poses(simulation: Simulation) -> Floats:
 
 
 def with_fixed_steps(problem: Problem, T: Floats) -> Problem:
-    """The problem with the steps between poses ``T`` (n, 4, 4) in place of its own, all alike certain."""
+    """The problem with the steps between poses ``T`` (n, 4, 4) in place of its own, all alike certain. Only a scan
+    that outlasts the IMU's samples may be missing in it."""
     rows = []
     for one in problem.rows:
         if one.model == "lidar":
             scans = problem.samples[one.sensor]
             which = np.flatnonzero(scans.values[1:, 12:].any(axis=1))
-            if len(scans.t_s) != len(T) or len(which) != len(one):
+            if not len(T) - 1 <= len(scans.t_s) <= len(T) or len(which) != len(one):
                 raise ValueError(f"{len(T)} poses and {len(one)} rows do not belong to {len(scans.t_s)} scans")
             step = np.linalg.inv(T[which]) @ T[which + 1]
             data = one.data.copy()

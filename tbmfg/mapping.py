@@ -16,10 +16,9 @@ from tbmfg.lidar import clouds, raster
 from tbmfg.lidar.surfels import SurfelMap
 from tbmfg.mcap import read_log
 from tbmfg.measure import gyro_frame
-from tbmfg.pipeline import rig_for
 from tbmfg.prepare.samples import imu_steps
 from tbmfg.results import read_result_npz, refuse_existing_file
-from tbmfg.rig import Lidar, Rig
+from tbmfg.rig import Lidar, Rig, load_rig
 from tbmfg.state import Trajectory
 from tbmfg.timeseries import Floats, Log, seconds
 
@@ -58,7 +57,7 @@ def make(
     for file in (output, output.with_suffix(".png")):
         refuse_existing_file(file, force)
     log = read_log(log_path)
-    rig, _ = rig_for(log, str(folder / "rig.yaml"))
+    rig = load_rig(folder / "rig.yaml")
     path = read_result_npz(folder / "result.npz")
     o3d = open3d()
     blur, cloud, waiting = SurfelMap(THICK_M, full=np.inf), o3d.geometry.PointCloud(), []
