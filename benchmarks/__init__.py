@@ -17,6 +17,7 @@ from __future__ import annotations
 
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
+    "attitude": "benchmarks.attitude",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",

@@ -85,5 +85,8 @@ def level(specific_force: Floats) -> Floats:
 
 
 def split_yaw_tilt(rotvec_n: Floats) -> tuple[Floats, Floats]:
-    """Attitude error as a rotation vector in n -> its part about the vertical, and the tilt's size; rad."""
-    return rotvec_n[..., 2], np.linalg.norm(rotvec_n[..., :2], axis=-1)
+    """Attitude error as a rotation vector in n (..., 3) -> its turn about the vertical (heading), and the size of the
+    tilt that is left (inclination); rad. Exact for large errors: BROAD (Laidig et al., Data 6(7), 2021), sec. 4."""
+    half = 0.5 * np.linalg.norm(rotvec_n, axis=-1)
+    vector = 0.5 * rotvec_n * np.sinc(half / np.pi)[..., None]
+    return 2.0 * np.arctan2(vector[..., 2], np.cos(half)), 2.0 * np.arcsin(np.linalg.norm(vector[..., :2], axis=-1))

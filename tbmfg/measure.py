@@ -180,7 +180,9 @@ def magnetometer_rows(
     used, mean, count = _group(k, carried)
     z = np.einsum("nji,nj->ni", frame.at(keyframes_s[used]), mean)
     north = np.full((len(used), 1), north_direction(x_axis_azimuth))
-    sigma = (sensor.sigma / np.sqrt(count))[:, None]
+    # samples average their noise away, but not the disturbance that they share
+    lasting = sensor.disturbance**2 * _dependence(keyframes_s, sensor.disturbance_time)[used]
+    sigma = np.sqrt(sensor.sigma**2 / count + lasting)[:, None]
     return Rows(fields.sensor, "magnetometer", used, used, z, north, sigma, calib, count, sensor.loss)
 
 
@@ -220,10 +222,14 @@ def _stretch_of(t_s: Floats, intervals: list[tuple[float, float]]) -> np.ndarray
 
 
 def bounded_rows(keyframes_s: Floats, centre_n: Floats, radius: float, speed: float) -> Rows:
-    """A body that stays within ``radius`` of ``centre_n`` and below ``speed``, read as sds, at every keyframe."""
+    """A body that stays within ``radius`` of ``centre_n`` and below ``speed``, read as sds, at every keyframe.
+
+    It crosses its volume in radius / speed: keyframes closer than that tell the same thing again.
+    """
     k = np.arange(len(keyframes_s))
     z = np.tile(np.concatenate([centre_n, np.zeros(3)]), (len(k), 1))
-    sigma = np.tile(np.repeat([radius, speed], 3), (len(k), 1))
+    repeated = np.sqrt(_dependence(keyframes_s, radius / speed))
+    sigma = repeated[:, None] * np.repeat([radius, speed], 3)
     ones = np.ones(len(k), dtype=int)
     return Rows("motion", "bounded", k, k, z, np.zeros((len(k), 0)), sigma, slice(0, 0), ones)
 
@@ -234,6 +240,14 @@ def _group(k: np.ndarray, values: Floats) -> tuple[np.ndarray, Floats, np.ndarra
     total = np.zeros((len(used), values.shape[1]))
     np.add.at(total, inverse, values)
     return used, total / count[:, None], count
+
+
+def _dependence(keyframes_s: Floats, correlation_s: float) -> Floats:
+    """Factor on the variance at each keyframe (n,) with which rows taken as independent weigh no more than an error of
+    that correlation time: 2 tau / interval, the density of a first-order Gauss-Markov process at low frequency."""
+    if len(keyframes_s) < 2:
+        return np.ones(len(keyframes_s))
+    return np.maximum(1.0, 2.0 * correlation_s / np.gradient(keyframes_s))
 
 
 def _running_mean(values: Floats, count: int) -> Floats:

@@ -271,18 +271,24 @@ class Magnetometer(Sensor):
 
     unit: Literal["T", "G", "uT", "nT"] = Field("T", description="Unit of the messages; ROS has T.")
     sigma_deg: Positive = Field(2.0, description="Of the horizontal direction, per sample.")
+    disturbance_deg: NotNegative = Field(0.0, description="Sd of a local field's turn of it, which does not average.")
+    disturbance_s: Positive = Field(1.0, description="How long such a turn lasts, on the move: correlation time.")
     declination_deg: Number = Field(0.0, description="Magnetic north from true north, east positive.")
     declination_sd_deg: CalibrationSd = Field(0.0, description="0 or null: the declination is not estimated.")
     hard_iron_ut: Triple = Field(ZERO, description="Field of the machine in sensor axes, microtesla; subtracted.")
     rpy_deg: Triple = Field(ZERO, description="Turns sensor axes into b: roll, pitch, yaw.")
-    clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
+    clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time; the delay of the sensor's filter is part.")
+    clock_offset_sd_s: CalibrationSd = Field(0.0, description="0 or null: the offset is not looked for in the log.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
     sigma = si("sigma_deg", DEG)
+    disturbance = si("disturbance_deg", DEG)
+    disturbance_time = si("disturbance_s")
     declination = si("declination_deg", DEG)
     declination_sd = si("declination_sd_deg", DEG)
     hard_iron = si("hard_iron_ut", MICRO_TESLA)
     clock_offset = si("clock_offset_s")
+    clock_offset_sd = si("clock_offset_sd_s")
 
     @property
     def R_bm(self) -> Floats:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tbmfg.evaluation.correlation import correlation_time, effective_samples
 from tbmfg.evaluation.metrics import align, chi_square_bounds, evaluate, nees, trajectory_errors, truth_at
+from tbmfg.geometry import split_yaw_tilt
 from tbmfg.results import write_tum
 from tbmfg.state import POS, ROT, Trajectory, Truth
 
@@ -225,3 +226,13 @@ def test_ape_equals_evo(tmp_path):
     metrics = evaluate(found, truth)
     assert metrics["ape_rms_m"] == pytest.approx(float(stated["rmse"]), abs=1e-6)
     assert metrics["ape_max_m"] == pytest.approx(float(stated["max"]), abs=1e-6)
+
+
+def test_split_of_an_attitude_error_is_that_of_the_dataset():
+    """Laidig et al. (2021): q = q_est q_true^-1 in n; heading 2 atan(z / w), inclination 2 acos sqrt(w^2 + z^2)."""
+    rotvec = np.random.default_rng(1).normal(size=(200, 3)) * np.linspace(1e-6, 1.5, 200)[:, None]
+    rotvec = rotvec[np.linalg.norm(rotvec, axis=1) < np.pi]
+    z, w = Rotation.from_rotvec(rotvec).as_quat(canonical=True).T[2:]
+    heading, inclination = split_yaw_tilt(rotvec)
+    assert_allclose(np.abs(heading), 2 * np.arctan(np.abs(z / w)), rtol=1e-9)
+    assert_allclose(np.cos(inclination / 2), np.sqrt(w**2 + z**2), rtol=1e-9)

@@ -307,6 +307,29 @@ def test_bound_at_every_keyframe():
     assert_array_equal(rows.i, np.arange(4))
 
 
+def test_a_bound_weighs_the_same_at_any_rate_of_keyframes():
+    """Over a second, ten times the keyframes tell no more about where a body dwells that crosses its volume in 2 s."""
+    information = []
+    for rate in (1.0, 10.0, 100.0):
+        rows = measure.bounded_rows(np.arange(0.0, 20.0, 1.0 / rate), np.zeros(3), 0.5, 0.25)
+        information.append(np.sum(rows.sigma[:, 0] ** -2.0))
+    # a first-order Gauss-Markov process of sd 0.5 m and time 2 s has at low frequency the density 2 x 0.5^2 x 2
+    assert_allclose(information, 20.0 / (2 * 0.5**2 * 2), rtol=1e-9)
+
+
+def test_what_disturbs_a_compass_does_not_average_away():
+    simulation = flight(duration=10.0)
+    frame = frame_of(simulation.clean["imu"], np.zeros(3))
+    field = simulation.clean["magnetometer"]
+    t_s = (field.t_ns - frame.steps.t0_ns) * 1e-9
+    sensor = Magnetometer(topic="/mag", sigma_deg=2.0, disturbance_deg=3.0, disturbance_s=1.0)
+    for interval in (0.05, 0.25):
+        keyframes = np.arange(0.0, 9.9, interval)
+        rows = measure.magnetometer_rows(sensor, Samples("m", t_s, field["field"]), keyframes, frame, 0.5, slice(0, 1))
+        expected = np.radians(np.sqrt(2.0**2 / rows.samples + 3.0**2 * 2.0 / interval))
+        assert_allclose(rows.sigma[:, 0], expected, rtol=1e-9)
+
+
 def test_running_mean_is_centred_and_fair_at_the_ends():
     ramp = np.arange(20.0)
     assert_allclose(measure._running_mean(ramp, 5)[2:-2], ramp[2:-2])

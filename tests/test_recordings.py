@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from benchmarks import attitude
 from tbmfg.mcap import read_log
 from tbmfg.pipeline import compare, run
 from tbmfg.prepare import prepare
@@ -50,3 +51,14 @@ def test_husky_odometer_with_the_jitter_of_its_stamps():
     lost = int(np.sum(spacing > 1.5 * np.median(spacing)))
     assert len(rows) >= len(problem.keyframe_edges) - 1 - 2 * lost - 2
     assert rows.samples.sum() > 0.98 * len(spacing)
+
+
+def test_hand_held_unit_in_a_disturbed_field():
+    """BROAD: IMU and magnetometer alone, shipped rig, the dataset's own errors. All trials: benchmarks attitude."""
+    trial = data("").parent / "broad_attitude_mag" / "25_disturbed_tapping_B.npz"
+    rows = attitude.one_trial(trial, ["batch", "ins"], [])
+    error = {(row.estimator, row.metric): row.mean for row in rows}
+    assert error["batch", "total"] <= 1.15
+    assert error["batch", "inclination"] <= 0.5
+    assert error["batch", "nees"] <= 5.0  # per dof; scale factors and misalignment are no white noise
+    assert error["ins", "total"] <= 2.2

@@ -13,7 +13,7 @@ import numpy as np
 from tbmfg import gnss
 from tbmfg.errors import EstimationError, RigError
 from tbmfg.inertial.steps import to_ns
-from tbmfg.prepare import scans, search
+from tbmfg.prepare import magnetic, scans, search
 from tbmfg.prepare.samples import ALONE, imu_steps, is_position, losses, usable_samples
 from tbmfg.prepare.start import align, parameters_of
 from tbmfg.problem import Problem, breakdown_explained
@@ -55,8 +55,10 @@ def prepare(
         for name in lidars:
             scans.register(log, name, setup, outages, lambda share: tell("LiDAR odometry", share))
         setup.parameters = parameters_of(rig, setup.samples)
+        delays = magnetic.onto_gyro_clock(setup)
         offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
         problem = search.find(setup, offsets, tell)
+        problem.calibration |= delays
     problem.intervals = [
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
