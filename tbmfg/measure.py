@@ -10,7 +10,7 @@ from tbmfg.earth import north_direction
 from tbmfg.geometry import exp_so3, rotation_from_rpy
 from tbmfg.inertial.steps import GAP, Steps, step_index
 from tbmfg.inertial.strapdown import rotations
-from tbmfg.rig import Barometer, Keyframes, Magnetometer, Odometer, PositionSensor
+from tbmfg.rig import Barometer, Keyframes, Laser, Magnetometer, Odometer, PositionSensor
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
 
@@ -184,6 +184,42 @@ def magnetometer_rows(
     lasting = sensor.disturbance**2 * _dependence(keyframes_s, sensor.disturbance_time)[used]
     sigma = np.sqrt(sensor.sigma**2 / count + lasting)[:, None]
     return Rows(fields.sensor, "magnetometer", used, used, z, north, sigma, calib, count, sensor.loss)
+
+
+def laser_rows(
+    sensor: Laser,
+    spots: Samples,
+    keyframes_s: Floats,
+    frame: GyroFrame,
+    acc: Floats,
+    gravity: float,
+    origin_n: Floats,
+    calib: slice,
+) -> Rows:
+    """Spots averaged to the nearest keyframe, and with them the detector as the IMU carries it there: ``acc`` (n, 3)
+    compensated specific force in b. A machine that shakes by millimetres moves its detector under the spot."""
+    t = spots.t_s - sensor.clock_offset
+    k = nearest(keyframes_s, t)
+    lag = t - keyframes_s[k]
+    R_k = frame.at(keyframes_s)[k].transpose(0, 2, 1)
+    R = R_k @ frame.at(t) @ sensor.T_bd.R
+    arm = np.einsum("nij,nj->ni", R_k @ frame.at(t), np.tile(sensor.T_bd.xyz, (len(t), 1)))
+    # displacement by the specific force between keyframe and spot, resolved at the keyframe
+    force = np.einsum("nij,nj->ni", frame.R_0t[:-1], acc)
+    edges, dt = frame.steps.edges_s, frame.steps.dt[:, None]
+    velocity = _cumulative(force * dt)
+    way = _cumulative(velocity[:-1] * dt + 0.5 * force * dt**2)
+    at_t, at_k, v_k = (
+        _interpolate(edges, v, x) for v, x in ((way, t), (way, keyframes_s[k]), (velocity, keyframes_s[k]))
+    )
+    moved = np.einsum("nij,nj->ni", R_k, at_t - at_k - v_k * lag[:, None])
+    fall = -0.5 * gravity * lag**2
+    used, mean, count = _group(k, np.column_stack([spots.values, lag, fall, arm + moved, R[:, :, 0], R[:, :, 1]]))
+    # tilted, the line passes the origin of the problem's heights elsewhere than that of n
+    line = sensor.line + sensor.tilt * origin_n[2] - origin_n[:2]
+    data = np.column_stack([mean[:, 2:], np.tile(line, (len(used), 1))])
+    sigma = np.tile((sensor.sigma / np.sqrt(count))[:, None], 2)
+    return Rows(spots.sensor, "laser", used, used, mean[:, :2], data, sigma, calib, count, sensor.loss)
 
 
 def barometer_rows(sensor: Barometer, heights: Samples, keyframes_s: Floats, origin_n: Floats, drift: int) -> Rows:

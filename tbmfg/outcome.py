@@ -128,6 +128,11 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             found[f"{sensor}_mounting_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
             degrees = np.rad2deg(c[turn]), np.rad2deg(sd[turn])
             found[f"{sensor}_mounting_turn_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), k + 3 in free)
+        elif what == "tilt_x":
+            degrees = np.rad2deg(c[k : k + 2]), np.rad2deg(sd[k : k + 2])
+            found[f"{sensor}_tilt_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
+        elif what == "offset_x":
+            found[f"{sensor}_offset_m"] = Calibrated(tuple(c[k : k + 2]), tuple(sd[k : k + 2]), estimated)
         elif what == "scale":
             found[f"{sensor}_scale"] = Calibrated(c[k], sd[k], estimated)
     return found

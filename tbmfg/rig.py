@@ -313,17 +313,30 @@ class Barometer(Sensor):
 
 
 class Laser(Sensor):
-    """Spot of a plumb laser on the machine's detector, in the detector's own x and y."""
+    """Spot of a fixed laser on the machine's detector, in the detector's own x and y. Defaults: a plumb laser."""
 
     unit: Literal["m", "mm"] = Field("m", description="Unit of the messages; ROS has m.")
     sigma_mm: Positive = Field(0.2, description="Of the spot, per axis.")
     half_width_mm: Positive | None = Field(
         None, description="Of the detector: a spot at its edge or beyond is left out; null: not checked."
     )
-    T_bd: Mounting = Field(Mounting(), description="The detector in b.")
+    T_bd: Mounting = Field(
+        Mounting(), description="The detector in b; with x forward and y right its z points down: rpy_deg [180, 0, 0]."
+    )
+    line_m: tuple[Number, Number] = Field((0.0, 0.0), description="x, y of n where the laser's line passes z = 0.")
+    tilt_deg: tuple[Number, Number] = Field((0.0, 0.0), description="Of the line from plumb, towards n's x and y.")
+    tilt_sd_deg: CalibrationSd = Field(0.0, description="Per axis; 0 or null: the tilt is not estimated.")
+    offset_sd_mm: CalibrationSd = Field(0.0, description="Of the reading's zero, per axis; 0 or null: not estimated.")
+    clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
+    loss: Loss = Field("huber", description="Weight of outliers, such as light scattered by dust, in the graph.")
 
     sigma = si("sigma_mm", MM)
+    line = si("line_m")
+    tilt = si("tilt_deg", DEG)
+    tilt_sd = si("tilt_sd_deg", DEG)
+    offset_sd = si("offset_sd_mm", MM)
     half_width = si("half_width_mm", MM)
+    clock_offset = si("clock_offset_s")
 
 
 class Lidar(Sensor):

@@ -205,6 +205,43 @@ def barometer(z, data, xi, xj, c):
 
 
 @njit(cache=True)
+def laser(z, data, xi, xj, c):
+    """Spot on a detector, where the laser's line meets the detector's plane; in the detector's x and y.
+
+    z (2): spot [m]. data (13): mean lag behind the keyframe [s], fall g lag^2 / 2 in it [m] (z of n), the detector's
+    origin l and axes e_x, e_y in b, carried by the IMU over the lag, and x, y of n where the line passes z = 0.
+    c (4): tilt (t_x, t_y) of the line, direction k = (t_x, t_y, 1); zero of the reading in the detector's axes [m].
+    With o = p + v lag + fall + R l, normal m = e_x x e_y and the line at q + s k: m . R^T (q + s k - o) = 0, and
+    h = (e_x, e_y) . R^T (q + s k - o) + zero.
+    """
+    n, d = len(z), xi.shape[1] - 6
+    r, Ji, Jc = np.empty((n, 2)), np.zeros((n, 2, d)), np.zeros((n, 2, 4))
+    k_n = np.array([c[0], c[1], 1.0])
+    for row in range(n):
+        x, lag, arm = xi[row], data[row, 0], data[row, 2:5]
+        e_x, e_y = data[row, 5:8], data[row, 8:11]
+        m = np.cross(e_x, e_y)
+        down = x[9:12] + x[12:15] * lag
+        down[2] += data[row, 1]
+        down[:2] -= data[row, 11:13]
+        from_line_b = _unrotate(x, down) + arm  # o - q
+        k_b = _unrotate(x, k_n)
+        s = (m @ from_line_b) / (m @ k_b)
+        w = s * k_b - from_line_b
+        for a in range(2):
+            e = e_x if a == 0 else e_y
+            share = (e @ k_b) / (m @ k_b)
+            across = share * m - e  # what a shift of the detector does to the reading, in b
+            turn = np.cross(e, w) - share * np.cross(m, w) + np.cross(arm, across)
+            across_n = _rotate(x, across)
+            r[row, a] = e @ w + c[2 + a] - z[row, a]
+            for b in range(3):
+                Ji[row, a, b], Ji[row, a, 3 + b], Ji[row, a, 6 + b] = turn[b], across_n[b], across_n[b] * lag
+            Jc[row, a, 0], Jc[row, a, 1], Jc[row, a, 2 + a] = -s * across_n[0], -s * across_n[1], 1.0
+    return r, Ji, np.zeros((n, 2, 0)), Jc
+
+
+@njit(cache=True)
 def velocity(z, data, xi, xj, c):
     """Velocity in n [m/s]: z (3); zero while the machine stands."""
     n, d = len(z), xi.shape[1] - 6
@@ -278,7 +315,7 @@ def lidar(z, data, xi, xj, c):
 
 
 MODELS: dict[str, Callable] = {
-    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, velocity, rotation, bounded, lidar)
+    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, laser, velocity, rotation, bounded, lidar)
 }
 
 

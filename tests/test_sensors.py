@@ -24,6 +24,8 @@ X_J = np.concatenate(
      [0.017, -0.019, 0.03], [-0.8, 0.5]]
 )  # fmt: skip
 
+R_BD = rotation_from_rpy(np.array([np.pi, 0.1, 0.3]))  # of a detector that looks down
+
 # measured values, auxiliary data, calibrations, and a bound on the third derivatives of h (its size or curvature)
 CASES = {
     "prism": ([39.1, -70.4, 13.2], [0.013, 0.7, -1.1, 0.9], [0.31, -0.52, 0.83, 0.006], 80.0),
@@ -37,6 +39,13 @@ CASES = {
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
     "magnetometer": ([14.0, -17.0, -31.0], [0.4], [0.05], 20.0),
     "barometer": ([11.2], [0.04, 1.0], [], 20.0),
+    # tilted by some 20 degrees, 15 m above z = 0: third derivatives grow as the distance over cos^4
+    "laser": (
+        [0.3, -0.2],
+        [0.04, -0.008, 0.2, -0.1, 0.4, *(R_BD @ [1, 0, 0]), *(R_BD @ [0, 1, 0]), 38.0, -69.0],
+        [0.02, -0.03, 0.004, 0.006],
+        4000.0,
+    ),
     "velocity": ([0.2, -0.1, 0.3], [], [], 5.0),
     "bounded": ([38.0, -69.0, 11.0, 0.1, 0.2, 0.3], [], [], 80.0),
 }
@@ -46,6 +55,7 @@ CALIBRATIONS = {
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination"],
+    "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
 
 

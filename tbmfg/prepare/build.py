@@ -12,7 +12,7 @@ from tbmfg.prepare.samples import ALONE, is_position
 from tbmfg.prepare.scans import lidar_rows
 from tbmfg.prepare.start import Setup
 from tbmfg.problem import Inertial, Prior, Problem
-from tbmfg.rig import Barometer, Lidar, Magnetometer, Odometer, PositionSensor, kind_of
+from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, kind_of
 from tbmfg.state import BG, NAV, ROT
 from tbmfg.timeseries import Floats
 
@@ -50,6 +50,12 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
             rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, rig.origin.x_axis_azimuth, calib))
         elif isinstance(sensor, Lidar):
             rows.append(lidar_rows(sensor, s, keyframes, setup, calib))
+        elif isinstance(sensor, Laser):
+            rows.append(
+                measure.laser_rows(
+                    sensor, s, keyframes, setup.frame, setup.acc, rig.origin.gravity, setup.origin_n, calib
+                )
+            )
         elif isinstance(sensor, Barometer):
             rows.append(measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names)))
             drift_names.append(f"{name}.bias")

@@ -27,8 +27,8 @@ VALUES = {  # column of the series that each kind of sensor measures with
     "laser": lambda series: series["point"][:, :2],
 }
 ALONE = (
-    "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer, barometer or lidar too, "
-    "or a motion bound in the rig"
+    "nothing but the IMU to go by; an estimate needs a prism, gnss, odometer, magnetometer, barometer, laser or lidar "
+    "too, or a motion bound in the rig"
 )
 LEAST_IMU = 3
 

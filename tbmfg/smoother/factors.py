@@ -26,6 +26,7 @@ PARTS = {
     "odometer": ("XB", "X"),
     "magnetometer": ("X", ""),
     "barometer": ("XVD", ""),
+    "laser": ("XV", ""),
     "bounded": ("XV", ""),
     "lidar": ("XV", "XV"),
     "rotation": ("X", "X"),
