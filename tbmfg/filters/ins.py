@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+from numba import njit
 from scipy.stats import chi2
 
 from tbmfg.filters.kalman import correct, innovation, predict
@@ -76,14 +76,9 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     for k in range(n):
         if k > 0:
             previous = x.copy()
-            _clone(P, clone)
-            edges = problem.keyframe_edges[k - 1 : k + 1]
-            elapsed = steps.edges_s[edges[1]] - steps.edges_s[edges[0]]
-            pieces = int(np.ceil(elapsed / LONGEST_S - 1e-9))
-            cuts = edges if pieces <= 1 else np.linspace(*edges, pieces + 1).astype(int)
-            for first, last in pairwise(cuts):
-                x[:21], Phi, Q = propagate(x[:21], first, last, steps.edges_s, inertial.gyro, inertial.acc, *noise)
-                P = predict(P, Phi, Q)
+            first, last = problem.keyframe_edges[k - 1 : k + 1]
+            x, P = _advance(x, P, first, last, steps.edges_s, inertial.gyro, inertial.acc, *noise)
+            elapsed = steps.edges_s[last] - steps.edges_s[first]
             P[np.arange(NAV, d), np.arange(NAV, d)] += problem.drift_walk**2 * elapsed
         for rows in problem.rows:
             sensor = rows.sensor
@@ -111,11 +106,21 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     return Filtered(xs, covs, c, c_cov, nis, gated, float(cost), reopened)
 
 
-def _clone(P: Floats, clone: slice) -> None:
-    """Make the clone's block a copy of the current pose (rotation and position), in place."""
-    P[clone] = P[:6]
-    P[:, clone] = P[:, :6]
-    P[clone, clone] = P[:6, :6]
+@njit(cache=True)
+def _advance(x, P, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_ba, earth_n, gravity_n):
+    """State ``x`` and covariance ``P`` (n, n) from edge ``first`` to edge ``last``; the last six of ``P``, the clone,
+    become a copy of the pose that is left."""
+    x, P, clone = x.copy(), P.copy(), len(P) - 6
+    P[clone:] = P[:6].copy()
+    P[:, clone:] = P[:, :6].copy()
+    pieces = max(int(np.ceil((edges[last] - edges[first]) / LONGEST_S - 1e-9)), 1)
+    for piece in range(pieces):
+        start, end = first + (last - first) * piece // pieces, first + (last - first) * (piece + 1) // pieces
+        x[:21], Phi, Q = propagate(
+            x[:21], start, end, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_ba, earth_n, gravity_n
+        )
+        P = predict(P, Phi, Q)
+    return x, P
 
 
 def _linearise(rows: Rows, r: int, x, previous, c, size, d, m, columns, offset) -> tuple[Floats, Floats]:
