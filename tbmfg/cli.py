@@ -381,6 +381,8 @@ def _print_comparison(summaries: dict[str, dict[str, Any]], output: str) -> None
     )
     if first["metrics"] is not None:
         typer.echo(f"against {first['truth']}; NEES of a consistent estimator: {first['metrics']['nees_dof']}")
+        if any(column.key.endswith("_over_bound") for column in columns):
+            typer.echo("bound: Cramer-Rao, from the whole log for batch and (last), from the past alone for the others")
     typer.echo(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
     for name, why in comparison.not_run(summaries).items():
         typer.echo(f"{name} not run: {why}")

@@ -29,6 +29,8 @@ COLUMNS = (
     Column("attitude deg", "attitude_rms_deg"),
     Column("yaw deg", "yaw_rms_deg"),
     Column("velocity mm/s", "velocity_rms_mps", 1e3),
+    Column("position / bound", "position_over_bound"),
+    Column("attitude / bound", "attitude_over_bound"),
     Column("NEES", "nees_mean"),
 )
 

@@ -25,13 +25,15 @@ Progress = Callable[[float], None]
 @dataclass(frozen=True, slots=True)
 class Estimator:
     """``run`` loads what it needs when called; ``needs`` lists the sensor kinds it cannot do without; ``switches``
-    loads the model of what the rig may set under ``estimators``."""
+    loads the model of what the rig may set under ``estimators``; ``whole``: its trajectory knows the whole log, and is
+    held to the bound of smoothing."""
 
     run: Callable[[Problem, Progress], Result]
     summary: str
     needs: tuple[str, ...]
     source: str
     switches: Callable[[], type[Node]] = lambda: Node
+    whole: bool = False
 
 
 def ins(problem: Problem, progress: Progress) -> Result:
@@ -149,6 +151,7 @@ OWN: dict[str, Estimator] = {
         "smooths the whole log: Gauss-Newton over GTSAM's IMU factors and all sensors",
         ("imu",),
         "Dellaert & Kaess (2017); Forster et al. (2017)",
+        whole=True,
     ),
     "fixed-lag": Estimator(
         fixed_lag,

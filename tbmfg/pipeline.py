@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ from tbmfg.state import Calibrated, Result, Truth
 from tbmfg.timeseries import NS, Log
 
 if TYPE_CHECKING:
+    from tbmfg.bounds import Bounds
     from tbmfg.problem import Problem
     from tbmfg.report import Report
     from tbmfg.storage import Place
@@ -44,7 +45,8 @@ UNUSED = ("pose_cov", "twist_cov")  # columns of odometry, most of its bytes: no
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One log, prepared once: what every estimator of a run or a comparison is given."""
+    """One log, prepared once: what every estimator of a run or a comparison is given. ``bounds`` holds what accuracy
+    is possible, or why that is not known, once it has been asked for."""
 
     log: Log
     log_path: str
@@ -53,6 +55,7 @@ class Session:
     assumed: tuple[str, ...]
     options: dict[str, Any]
     shared_s: float
+    bounds: list[Bounds | str] = field(default_factory=list)
 
     def estimate(self, name: str, progress: Progress | None = None) -> tuple[Result, dict[str, Any]]:
         """Result and summary of one estimator. ``wall_s`` runs from opening the log to the result, reading and
@@ -85,12 +88,41 @@ class Session:
         }
         poses = self.truth(result)
         if poses is not None:
-            t0_ns = self.prepared.t0_ns
-            lost = [(t0_ns + round(start * NS), t0_ns + round(end * NS)) for _, start, end in self.options["outages"]]
-            summary["metrics"] = evaluate(result.trajectory, poses, lost)
+            summary["metrics"] = evaluate(result.trajectory, poses, self._lost())
             if result.smoothed is not None:
-                summary["metrics_smoothed"] = evaluate(result.smoothed, poses, lost)
+                summary["metrics_smoothed"] = evaluate(result.smoothed, poses, self._lost())
         return result, summary
+
+    def hold_to_bound(self, result: Result, summary: dict[str, Any]) -> None:
+        """Add to the metrics of ``summary`` the Cramer-Rao bounds of this log and the errors over them.
+
+        The bounds are made once, at the truth of the first result; where they cannot be, a warning says why.
+        """
+        poses = self.truth(result)
+        if poses is None:
+            return
+        from tbmfg.bounds import cramer_rao
+        from tbmfg.estimators import ESTIMATORS
+        from tbmfg.evaluation.metrics import expected, over
+
+        if not self.bounds:
+            try:
+                self.bounds.append(cramer_rao(self.prepared, poses))
+            except EstimationError as error:
+                self.bounds.append(f"errors are not compared with their bound: {error}")
+        bounds = self.bounds[0]
+        if isinstance(bounds, str):
+            summary["warnings"] = [*summary["warnings"], bounds]
+            return
+        causal = bounds.smoothing if ESTIMATORS[result.estimator].whole else bounds.filtering
+        for key, bound in (("metrics", causal), ("metrics_smoothed", bounds.smoothing)):
+            if key in summary:
+                summary[key] |= over(summary[key], expected(bound, poses, self._lost()))
+
+    def _lost(self) -> list[tuple[int, int]]:
+        """The outages that were asked for, as stamps."""
+        t0_ns = self.prepared.t0_ns
+        return [(t0_ns + round(start * NS), t0_ns + round(end * NS)) for _, start, end in self.options["outages"]]
 
     def truth(self, result: Result) -> Truth | None:
         """What ``result`` is compared with, None where there is nothing."""
@@ -238,6 +270,7 @@ def compare(
 ) -> dict[str, dict[str, Any]]:
     """Run several estimators on one prepared log: {estimator: summary}, or {"not_run": why} for one that could not.
 
+    Where there is a truth, errors are also given over their Cramer-Rao bounds (``tbmfg.bounds``).
     With ``output`` every estimator's files go to a folder of its name, compare.json and report.html beside them.
     ``each`` is called with every estimator's name and result. The other arguments are those of :func:`run_result`.
     Raises TbmfgError when none ran.
@@ -259,6 +292,7 @@ def compare(
         if reason is None:
             try:
                 result, summaries[name] = session.estimate(name, progress)
+                session.hold_to_bound(result, summaries[name])
             except EstimationError as error:
                 reason = str(error)
         if reason is None and each is not None:

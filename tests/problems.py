@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import A, B, V, X
 from scipy.spatial.transform import Rotation
 
 import datasets
@@ -15,6 +17,7 @@ from datasets.simulate import Simulation, simulate
 from tbmfg.prepare import prepare
 from tbmfg.problem import Problem
 from tbmfg.rig import Rig, override, parse_rig
+from tbmfg.smoother import graph
 from tbmfg.timeseries import Floats, Log, Series, StreamCounts
 
 EPS = np.finfo(float).eps
@@ -170,3 +173,51 @@ def true_rig(simulation: Simulation) -> Rig:
         f"sensors.magnetometer.declination_deg={drawn['magnetometer']['declination_deg']}",
     ]
     return override(rig, settings)
+
+
+NATIVE = ("sensors.prism.clock_offset_sd_s=0", "sensors.prism.clock_offset_s=0", "sensors.prism.loss=none")
+
+
+def native_problem() -> Problem:
+    """A flight whose sensors GTSAM has factors for: prism and its arm, some 50 keyframes."""
+    problem = flight_problem(1, 6.0, NATIVE)
+    prism = next(rows for rows in problem.rows if rows.sensor == "prism")
+    prism = replace(prism, data=prism.data * [0.0, 1.0, 1.0, 1.0])
+    return replace(problem, rows=[prism], prior=replace(problem.prior, cov=problem.prior.filter_cov))
+
+
+def gtsam_graph(
+    problem: Problem, x: Floats, c: Floats, last: int | None = None
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, slice]:
+    """``native_problem`` up to keyframe ``last`` as a graph of GTSAM's own factors, its values at the states ``x``
+    (n, 21) and calibrations ``c``, and where the arm, A(0), lies in ``c``."""
+    last = len(x) - 1 if last is None else last
+    short = replace(problem, keyframe_edges=problem.keyframe_edges[: last + 1])
+    [prism], x = problem.rows, x[: last + 1]
+    prior, parameters = problem.prior, problem.parameters
+    g = graph.imu_graph(short, x)
+    turn = np.eye(6)
+    turn[3:, 3:] = prior.x[:9].reshape(3, 3)
+    pose = gtsam.Pose3(gtsam.Rot3(prior.x[:9].reshape(3, 3)), prior.x[9:12])
+    gaussian, sigmas = gtsam.noiseModel.Gaussian.Covariance, gtsam.noiseModel.Diagonal.Sigmas
+    g.add(gtsam.PriorFactorPose3(X(0), pose, gaussian(turn.T @ prior.cov[:6, :6] @ turn)))
+    g.add(gtsam.PriorFactorVector(V(0), prior.x[12:15], gaussian(prior.cov[6:9, 6:9])))
+    bias = gtsam.imuBias.ConstantBias(prior.x[15:18], prior.x[18:21])
+    g.add(gtsam.PriorFactorConstantBias(B(0), bias, gaussian(prior.cov[9:, 9:])))
+    arm = slice(parameters.names.index("prism.arm_x"), parameters.names.index("prism.arm_x") + 3)
+    g.add(gtsam.PriorFactorPoint3(A(0), parameters.mean[arm], sigmas(parameters.sd[arm])))
+    for k, z, sigma in zip(prism.j, prism.z, prism.sigma, strict=True):
+        if k <= last:
+            g.add(gtsam.GPSFactorArmCalib(X(int(k)), A(0), z, sigmas(sigma)))
+    values = graph.values(x, graph.no_bias(len(x)))
+    values.insert(A(0), c[arm])
+    return g, values, arm
+
+
+def gtsam_marginal(marginals: gtsam.Marginals, k: int, x: Floats) -> Floats:
+    """Joint covariance of keyframe k, (15, 15), in our chart at its state ``x`` (21,)."""
+    keys = gtsam.KeyVector([X(k), V(k), B(k)])
+    joint = marginals.jointMarginalCovariance(keys)
+    turn = np.eye(15)
+    turn[3:6, 3:6] = x[:9].reshape(3, 3)
+    return turn @ np.block([[joint.at(a, b) for b in keys] for a in keys]) @ turn.T

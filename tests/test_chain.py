@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tbmfg.smoother.chain import Block, eliminate
+from tbmfg.smoother.chain import Block, eliminate, newest
 from tests.problems import EPS
 
 
@@ -62,6 +62,25 @@ def test_solution_and_covariances_are_those_of_dense_least_squares(n, d, m):
         assert_allclose(covs[k], cov[k * d : (k + 1) * d, k * d : (k + 1) * d], atol=rounding * np.abs(cov).max())
     assert_allclose(c_cov, cov[n * d :, n * d :], atol=rounding * np.abs(cov).max())
     assert chain.undetermined() == []
+
+
+@pytest.mark.parametrize(("n", "d", "m"), [(12, 5, 3), (12, 5, 0), (1, 4, 2), (2, 17, 4), (30, 1, 1)])
+def test_covariance_of_the_newest_keyframe_is_that_of_the_rows_up_to_it(n, d, m):
+    blocks = blocks_of(n, d, m, np.random.default_rng(n))
+    found = newest(blocks, n, d, m)
+    assert found.shape == (n, d, d)
+    for k in range(n):
+        past = []
+        for block in blocks:
+            own = block.i + (block.A_j is not None) <= k
+            A_j = None if block.A_j is None else block.A_j[own]
+            past.append(Block(block.i[own], block.A_i[own], A_j, block.A_c[own], block.b[own]))
+        A, _ = dense(past, k + 1, d, m)
+        information = A.T @ A
+        cov = np.linalg.inv(information)
+        rounding = 100 * EPS * np.linalg.cond(information)
+        newest_rows = slice(k * d, (k + 1) * d)
+        assert_allclose(found[k], cov[newest_rows, newest_rows], atol=rounding * np.abs(cov).max())
 
 
 def test_against_gtsam_marginals():

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tbmfg import cli, pipeline
-from tbmfg.errors import LogError, TbmfgError
+from tbmfg.errors import EstimationError, LogError, TbmfgError
 from tbmfg.rig import parse_rig
 from tbmfg.state import Calibrated, Counts, Result, Trajectory
 from tbmfg.timeseries import Log, Series
@@ -34,6 +35,11 @@ def poses(n: int = 50, shift: float = 0.0) -> Trajectory:
         bias_gyro=np.zeros((n, 3)),
         cov=np.tile(np.eye(15), (n, 1, 1)),
     )
+
+
+def sure(sd: float) -> Trajectory:
+    """The poses with position and rotation known to ``sd`` in each axis, m and rad."""
+    return replace(poses(), cov=np.tile(sd**2 * np.eye(15), (50, 1, 1)))
 
 
 def toy_log() -> Log:
@@ -74,13 +80,16 @@ def toy(monkeypatch):
         calls.prepare.append({"rig": rig, "outages": outages, "without": without, "progress": progress})
         return SimpleNamespace(t0_ns=EPOCH_NS, rig=rig, samples={}, warnings=["imu: 3 samples lost"])
 
-    entry = SimpleNamespace(summary="Smoother.", needs=("imu", "prism"), source="tbmfg")
-    names = {"batch": entry, "fixed-lag": entry}
+    entry = SimpleNamespace(summary="Smoother.", needs=("imu", "prism"), source="tbmfg", whole=False)
+    names = {"batch": SimpleNamespace(**{**vars(entry), "whole": True}), "fixed-lag": entry}
     fakes = SimpleNamespace(ESTIMATORS=names, estimate=lambda *args, **options: calls.estimate(*args, **options))
     calls.estimate = toy_estimate
     fakes.check_switches = lambda rig: None
     fakes.unmet = lambda name, prepared: None
+    calls.bounds = lambda prepared, truth: SimpleNamespace(smoothing=sure(0.1), filtering=sure(0.4))
+    bounds = SimpleNamespace(cramer_rao=lambda *args: calls.bounds(*args))
     monkeypatch.setitem(sys.modules, "tbmfg.estimators", fakes)
+    monkeypatch.setitem(sys.modules, "tbmfg.bounds", bounds)
     monkeypatch.setitem(sys.modules, "tbmfg.prepare", SimpleNamespace(prepare=prepare))
     monkeypatch.setattr("tbmfg.mcap.read_log", read_log)
     monkeypatch.setattr("tbmfg.mcap.read_attachments", lambda path: read_log(path).attachments)
@@ -130,6 +139,38 @@ def test_smoothed_trajectories_have_their_own_metrics(toy, tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["metrics_smoothed"]["position_rms_m"] == 0.0
     assert (tmp_path / "smoothed.tum").exists()
+
+
+def test_compare_holds_errors_to_the_bound_of_the_past_or_of_the_whole_log(toy, tmp_path):
+    ran = tbmfg("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch,fixed-lag")
+    assert ran.exit_code == 0, ran.output
+    compared = json.loads((tmp_path / "compare.json").read_text())
+    # the toy is 0.5 m off; three axes of 0.1 and of 0.4 m
+    for metrics, bound in ((compared["batch"]["metrics"], 0.1), (compared["fixed-lag"]["metrics"], 0.4)):
+        assert metrics["bound_position_rms_m"] == pytest.approx(np.sqrt(3) * bound)
+        assert metrics["position_over_bound"] == pytest.approx(0.5 / np.sqrt(3) / bound)
+        assert metrics["attitude_over_bound"] == pytest.approx(0.0)
+        assert "velocity_over_bound" not in metrics, "the truth has no velocity"
+    last = compared["fixed-lag"]["metrics_smoothed"]
+    assert last["bound_position_rms_m"] == pytest.approx(np.sqrt(3) * 0.1)
+    assert "position / bound" in ran.stdout
+    assert "bound: Cramer-Rao" in ran.stdout
+    assert "2.89" in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_a_bound_that_cannot_be_made_is_said_and_stops_nobody(toy, tmp_path):
+    asked = []
+
+    def fails(*args):
+        asked.append(args)
+        raise EstimationError("the Cramer-Rao bound broke down")
+
+    toy.bounds = fails
+    ran = tbmfg("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch,fixed-lag")
+    assert ran.exit_code == 0, ran.output
+    assert len(asked) == 1
+    assert "warning: errors are not compared with their bound: the Cramer-Rao bound broke down" in ran.stdout
+    assert "bound_position_rms_m" not in json.loads((tmp_path / "compare.json").read_text())["batch"]["metrics"]
 
 
 def test_options_reach_the_stages(toy, tmp_path):

@@ -11,7 +11,16 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from tbmfg.evaluation.correlation import correlation_time, effective_samples
-from tbmfg.evaluation.metrics import align, chi_square_bounds, evaluate, nees, trajectory_errors, truth_at
+from tbmfg.evaluation.metrics import (
+    align,
+    chi_square_bounds,
+    evaluate,
+    expected,
+    nees,
+    over,
+    trajectory_errors,
+    truth_at,
+)
 from tbmfg.geometry import split_yaw_tilt
 from tbmfg.results import write_tum
 from tbmfg.state import POS, ROT, Trajectory, Truth
@@ -73,6 +82,29 @@ def test_outages_select_their_keyframes():
     shift[20:30, 1] = 2.0
     inside = (int(truth.t_ns[20]), int(truth.t_ns[29]))
     assert evaluate(estimate(truth, position_n=shift), truth, [inside])["outage_position_rms_m"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("arm_b", [(0.0, 0.0, 0.0), (30.0, -5.0, 8.0)])
+def test_what_a_covariance_says_is_the_size_of_errors_drawn_from_it(arm_b):
+    """Rotations of a degree about every axis of b by another sd, correlated with positions of decimetres."""
+    truth, rng = drive(20_000, 0.01), np.random.default_rng(4)
+    root = np.diag(np.repeat([0.01, 0.2, 0.1, 1e-3, 1e-5], 3) * np.tile([1.0, 2.0, 0.3], 5))
+    root[POS, ROT] = 0.1 * rng.standard_normal((3, 3))
+    drawn = rng.standard_normal((20_000, 15)) @ root.T
+    path = estimate(truth, drawn[:, ROT], drawn[:, POS], drawn[:, 6:9], root @ root.T)
+    outages = [(truth.t_ns[5000], truth.t_ns[9999])]
+    moved = truth.position_n + Rotation.from_quat(truth.quat_xyzw).apply(arm_b)
+    point = replace(truth, position_n=moved, arm_b=np.array(arm_b))
+    metrics, said = evaluate(path, point, outages), expected(path, point, outages)
+    names = {"position_rms_m", "outage_position_rms_m", "attitude_rms_deg", "yaw_rms_deg", "tilt_rms_deg"}
+    assert set(said) == names | ({"velocity_rms_mps"} if not any(arm_b) else set())
+    # 5000 draws: a mean square of one component has a relative sd of 2 %, its root of 1 %; arms bend what is linear
+    for name, value in said.items():
+        assert value == pytest.approx(metrics[name], rel=0.03), name
+    ratios = over(metrics, said)
+    assert ratios["bound_yaw_rms_deg"] == said["yaw_rms_deg"]
+    assert ratios["yaw_over_bound"] == pytest.approx(metrics["yaw_rms_deg"] / said["yaw_rms_deg"])
+    assert over(metrics, {"yaw_rms_deg": 0.0})["yaw_over_bound"] is None
 
 
 def test_missing_truth_columns_are_null_and_leave_position_nees():

@@ -16,7 +16,7 @@ from tbmfg.inertial.strapdown import correct_states, propagate
 from tbmfg.problem import GATE
 from tbmfg.sensors import Rows
 from tbmfg.smoother import batch, graph, losses
-from tests.problems import ERRORS, flight_problem, state_errors, worst
+from tests.problems import ERRORS, flight_problem, gtsam_graph, gtsam_marginal, native_problem, state_errors, worst
 
 LOSSES = ("none", "huber", "cauchy")
 
@@ -180,32 +180,10 @@ def test_imu_factor_says_the_same_as_the_filters_prediction():
 
 @pytest.fixture(scope="module")
 def native():
-    """A problem whose sensors GTSAM has factors for, and the same as GTSAM's graph: 30 keyframes, prism and its arm."""
-    settings = ("sensors.prism.clock_offset_sd_s=0", "sensors.prism.clock_offset_s=0", "sensors.prism.loss=none")
-    problem = flight_problem(1, 6.0, settings)
-    prism = rows_of(problem, "prism")
-    prism = replace(prism, data=prism.data * [0.0, 1.0, 1.0, 1.0])
-    problem = replace(problem, rows=[prism], prior=replace(problem.prior, cov=problem.prior.filter_cov))
+    """A problem whose sensors GTSAM has factors for, its solution, and the same as GTSAM's graph."""
+    problem = native_problem()
     found = solved(problem)
-
-    prior, parameters = problem.prior, problem.parameters
-    g = graph.imu_graph(problem, found.x)
-    turn = np.eye(6)
-    turn[3:, 3:] = prior.x[:9].reshape(3, 3)
-    pose = gtsam.Pose3(gtsam.Rot3(prior.x[:9].reshape(3, 3)), prior.x[9:12])
-    gaussian = gtsam.noiseModel.Gaussian.Covariance
-    g.add(gtsam.PriorFactorPose3(X(0), pose, gaussian(turn.T @ prior.cov[:6, :6] @ turn)))
-    g.add(gtsam.PriorFactorVector(V(0), prior.x[12:15], gaussian(prior.cov[6:9, 6:9])))
-    bias = gtsam.imuBias.ConstantBias(prior.x[15:18], prior.x[18:21])
-    g.add(gtsam.PriorFactorConstantBias(B(0), bias, gaussian(prior.cov[9:, 9:])))
-    arm = slice(parameters.names.index("prism.arm_x"), parameters.names.index("prism.arm_x") + 3)
-    sigmas = gtsam.noiseModel.Diagonal.Sigmas
-    g.add(gtsam.PriorFactorPoint3(A(0), parameters.mean[arm], sigmas(parameters.sd[arm])))
-    for k, z, sigma in zip(prism.j, prism.z, prism.sigma, strict=True):
-        g.add(gtsam.GPSFactorArmCalib(X(int(k)), A(0), z, sigmas(sigma)))
-    values = graph.values(found.x, graph.no_bias(len(found.x)))
-    values.insert(A(0), found.c[arm])
-    return problem, found, g, values, arm
+    return problem, found, *gtsam_graph(problem, found.x, found.c)
 
 
 def test_batch_ends_where_gtsam_ends(native):
@@ -227,13 +205,8 @@ def test_covariances_are_gtsams_marginals(native):
     _, found, g, values, arm = native
     marginals = gtsam.Marginals(g, values)
     for k in range(0, len(found.x), 7):
-        keys = gtsam.KeyVector([X(k), V(k), B(k)])
-        joint = marginals.jointMarginalCovariance(keys)
-        theirs = np.block([[joint.at(a, b) for b in keys] for a in keys])
-        turn = np.eye(15)
-        turn[3:6, 3:6] = found.x[k, :9].reshape(3, 3)
         sd = sds(found.cov[k])
-        found_k, expected = (c / np.outer(sd, sd) for c in (found.cov[k], turn @ theirs @ turn.T))
+        found_k, expected = (c / np.outer(sd, sd) for c in (found.cov[k], gtsam_marginal(marginals, k, found.x[k])))
         # Marginals is Cholesky: half the digits; the prior's chart as above
         assert not (fault := worst(found_k, expected, 2e-3, ERRORS, ERRORS)), f"keyframe {k}: {fault}"
     sd = sds(found.c_cov)[arm]

@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 
 from tbmfg.evaluation.correlation import effective_samples
 from tbmfg.geometry import skew, split_yaw_tilt
-from tbmfg.state import POS, ROT, Trajectory, Truth
+from tbmfg.state import POS, ROT, VEL, Trajectory, Truth
 from tbmfg.timeseries import Floats, Times
 
 GAP_RATIO = 5.0  # a truth interval this many times the median is a gap ...
@@ -56,9 +56,6 @@ def evaluate(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, 
     yaw = tilt = None
     if errors.rotation_n is not None:
         yaw, tilt = split_yaw_tilt(errors.rotation_n)
-    inside = np.zeros(len(errors.t_ns), dtype=bool)
-    for start, end in outages:
-        inside |= (errors.t_ns >= start) & (errors.t_ns <= end)
     usable = np.isfinite(errors.nees)
     metrics = {
         "ape_rms_m": _rms(errors.aligned_n),
@@ -68,7 +65,7 @@ def evaluate(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, 
         "yaw_rms_deg": _rms(yaw, np.rad2deg(1.0)),
         "tilt_rms_deg": _rms(tilt, np.rad2deg(1.0)),
         "velocity_rms_mps": _rms(errors.velocity_n),
-        "outage_position_rms_m": _rms(errors.position_n[inside]),
+        "outage_position_rms_m": _rms(errors.position_n[_inside(errors.t_ns, outages)]),
         "nees_mean": float(errors.nees[usable].mean()) if usable.any() else None,
         "nees_n_eff": effective_samples(errors.t_ns[usable], errors.nees[usable]) if usable.any() else None,
         "nees_dof": errors.nees_dof,
@@ -76,6 +73,36 @@ def evaluate(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, 
         "nees_evaluated": int(usable.sum()),
     }
     return {name: value if value is not None and np.isfinite(value) else None for name, value in metrics.items()}
+
+
+def expected(trajectory: Trajectory, truth: Truth, outages: Sequence[tuple[int, int]] = ()) -> dict[str, float | None]:
+    """What the covariance of ``trajectory`` says of the RMS errors under the same names in :func:`evaluate`, at the
+    keyframes that the truth covers: roots of mean traces."""
+    if truth.arm_b.any():
+        trajectory, truth = at_point(trajectory, truth.arm_b), replace(truth, velocity_n=None)
+    covered, true = truth_at(truth, trajectory.t_ns)
+    variances = np.diagonal(trajectory.cov[covered], axis1=1, axis2=2)
+    told = {"position_rms_m": _root(variances[:, POS])}
+    told["outage_position_rms_m"] = _root(variances[_inside(true.t_ns, outages), POS])
+    if true.quat_xyzw is not None:
+        R = Rotation.from_quat(true.quat_xyzw).as_matrix()
+        about_n = np.einsum("kij,kjl,kil->ki", R, trajectory.cov[covered, ROT, ROT], R)
+        degree = np.rad2deg(1.0)
+        told["attitude_rms_deg"] = _root(variances[:, ROT], degree)
+        told["yaw_rms_deg"], told["tilt_rms_deg"] = _root(about_n[:, 2:], degree), _root(about_n[:, :2], degree)
+    if true.velocity_n is not None:
+        told["velocity_rms_mps"] = _root(variances[:, VEL])
+    return {name: value if value is not None and np.isfinite(value) else None for name, value in told.items()}
+
+
+def over(metrics: dict[str, float | None], bound: dict[str, float | None]) -> dict[str, float | None]:
+    """The bounds under names of their own, ``bound_position_rms_m``, and every error over its own,
+    ``position_over_bound``."""
+    told = {f"bound_{name}": value for name, value in bound.items()}
+    for name, value in bound.items():
+        ratio = metrics[name] / value if value and metrics.get(name) is not None else None
+        told[f"{name.partition('_rms_')[0]}_over_bound"] = ratio
+    return told
 
 
 def trajectory_errors(trajectory: Trajectory, truth: Truth) -> Errors:
@@ -203,6 +230,19 @@ def _rms(values: Floats | None, unit: float = 1.0) -> float | None:
     if values is None or not len(values):
         return None
     return float(unit * np.sqrt((values**2).sum() / len(values)))
+
+
+def _root(variances: Floats, unit: float = 1.0) -> float | None:
+    """Root of the mean over rows of the sums of ``variances`` (m, k), times ``unit``; None without any."""
+    return float(unit * np.sqrt(variances.sum() / len(variances))) if len(variances) else None
+
+
+def _inside(t_ns: Times, outages: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Which stamps lie in one of the (start, end), both included."""
+    inside = np.zeros(len(t_ns), dtype=bool)
+    for start, end in outages:
+        inside |= (t_ns >= start) & (t_ns <= end)
+    return inside
 
 
 def _rotation_error(R_true: Rotation, quat_xyzw: Floats) -> Floats:

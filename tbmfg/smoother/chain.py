@@ -119,6 +119,28 @@ def _eliminate(U, u_start, B, b_start, n, d, m):
 
 
 @njit(cache=True)
+def _newest(U, u_start, B, b_start, n, d, m):
+    """Covariance of every x_k by the rows on it and on those before it, (n, d, d): as ``_eliminate``, but the rows on
+    x_k alone are taken first, and what they and the past say of [x_k, c] is inverted before x_{k+1} comes."""
+    out = np.zeros((n, d, d))
+    carry = np.zeros((d + m, d + m + 1))
+    for k in range(n):
+        unary, binary = U[u_start[k] : u_start[k + 1]], B[b_start[k] : b_start[k + 1]]
+        V = np.zeros((d + m + len(unary), d + m + 1))
+        V[: d + m], V[d + m :] = carry, unary
+        _triangularise(V, len(V), d + m)
+        half = _upper_solve(V[: d + m, : d + m], np.eye(d + m))[:d]
+        out[k] = half @ half.T
+        if k < n - 1:
+            W = np.zeros((2 * (d + m) + len(binary), 2 * d + m + 1))
+            W[: d + m, :d], W[: d + m, 2 * d :] = V[: d + m, :d], V[: d + m, d:]
+            W[d + m : d + m + len(binary)] = binary
+            _triangularise(W, d + m + len(binary), 2 * d + m)
+            carry[:, :] = W[d : 2 * d + m, d:]
+    return out
+
+
+@njit(cache=True)
 def _upper_solve(R, Y):
     """R^-1 Y for upper triangular R (d, d) and Y (d, q)."""
     d, q = Y.shape
@@ -210,6 +232,11 @@ def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
     U, u_start, B, b_start = assemble(blocks, n, d, m)
     conditionals, border = _eliminate(U, u_start, B, b_start, n, d, m)
     return Elimination(conditionals, border, *lengths(blocks, n, d, m), n, d, m)
+
+
+def newest(blocks: list[Block], n: int, d: int, m: int) -> Floats:
+    """Covariance of each of n keyframes when it was the newest, by the rows that end at it or before, (n, d, d)."""
+    return _newest(*assemble(blocks, n, d, m), n, d, m)
 
 
 def marginal(blocks: list[Block], d: int, m: int) -> Block:
