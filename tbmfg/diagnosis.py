@@ -22,13 +22,27 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
     parameters = problem.parameters
     lines = []
     for k in parameters.free:
-        if sd[k] > UNOBSERVED * parameters.sd[k]:
-            what = parameters.names[k].rpartition(".")[2]
+        sensor, _, what = parameters.names[k].rpartition(".")
+        if kind_of(sensor) == "barometer":
+            lines += _depth(problem, path, sensor, float(sd[k]))
+        elif sd[k] > UNOBSERVED * parameters.sd[k]:
             lines.append(
                 f"{parameters.names[k]} is not observable on this log: its sd stays {sd[k]:.3g} of the prior's "
                 f"{parameters.sd[k]:.3g}; {_motion(path, what)}"
             )
     return lines
+
+
+def _depth(problem: Problem, path: Trajectory, sensor: str, scale_sd: float) -> list[str]:
+    """Say where the air's temperature, which is a barometer's scale, costs more than the barometer's noise."""
+    way = float(np.ptp(path.position_n[:, 2]))
+    if scale_sd * way < problem.rig.sensors[sensor].sigma:
+        return []
+    return [
+        f"{sensor}: depth is limited by the air's temperature: its scale is known to {scale_sd:.2%} (1 sd), "
+        f"{scale_sd * way:.2g} m over the {way:.3g} m between highest and lowest; a point surveyed at another height, "
+        "gnss or a prism would tell it"
+    ]
 
 
 def _motion(path: Trajectory, what: str) -> str:

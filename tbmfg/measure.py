@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tbmfg.earth import north_direction
+from tbmfg.errors import RigError
 from tbmfg.geometry import exp_so3, rotation_from_rpy
 from tbmfg.inertial.steps import GAP, Steps, step_index
 from tbmfg.inertial.strapdown import rotations
-from tbmfg.rig import Barometer, Keyframes, Laser, Magnetometer, Odometer, PositionSensor
+from tbmfg.rig import Barometer, Keyframes, Laser, Magnetometer, Odometer, PositionSensor, SurveyPoint
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
 
@@ -222,14 +223,42 @@ def laser_rows(
     return Rows(spots.sensor, "laser", used, used, mean[:, :2], data, sigma, calib, count, sensor.loss)
 
 
-def barometer_rows(sensor: Barometer, heights: Samples, keyframes_s: Floats, origin_n: Floats, drift: int) -> Rows:
-    """Pressure heights averaged to the nearest keyframe; ``heights.values`` (n,) m; ``drift`` the index of the bias."""
+def barometer_rows(
+    sensor: Barometer,
+    heights: Samples,
+    keyframes_s: Floats,
+    origin_n: Floats,
+    drift: int,
+    reference: float,
+    calib: slice,
+) -> Rows:
+    """Pressure heights averaged to the nearest keyframe; ``heights.values`` (n,) m; ``drift`` the index of the bias,
+    ``reference`` the height above ``origin_n`` from which on the scale counts."""
     t = heights.t_s - sensor.clock_offset
     k = nearest(keyframes_s, t)
     used, mean, count = _group(k, np.column_stack([heights.values - origin_n[2], t - keyframes_s[k]]))
-    data = np.column_stack([mean[:, 1], np.full(len(used), drift)])
+    data = np.column_stack([mean[:, 1], np.full(len(used), drift), np.full(len(used), reference)])
     sigma = (sensor.sigma / np.sqrt(count))[:, None]
-    return Rows(heights.sensor, "barometer", used, used, mean[:, :1], data, sigma, slice(0, 0), count, sensor.loss)
+    return Rows(heights.sensor, "barometer", used, used, mean[:, :1], data, sigma, calib, count, sensor.loss)
+
+
+def survey_times(points: tuple[SurveyPoint, ...], steps: Steps) -> Floats:
+    """When the machine stood at each point, s, (n,). Raises RigError for a time outside the log."""
+    ends = {"start": float(steps.edges_s[0]), "end": steps.end_s}
+    t = np.array([ends.get(point.at, point.at) for point in points], dtype=float)
+    for k in np.flatnonzero((t < ends["start"]) | (t > ends["end"])):
+        raise RigError(f"survey.{k}.at: {t[k]:g} s is outside the log, which ends at {ends['end']:.1f} s")
+    return t
+
+
+def survey_rows(points: tuple[SurveyPoint, ...], t_s: Floats, keyframes_s: Floats, origin_n: Floats) -> Rows:
+    """Surveyed points at the keyframes that lie at their times, those up to the last keyframe."""
+    order = [k for k in np.argsort(t_s, kind="stable") if t_s[k] <= keyframes_s[-1] + 1e-9]
+    at = nearest(keyframes_s, t_s[order])
+    z = np.array([points[k].position for k in order]).reshape(-1, 3) - origin_n
+    sigma = np.array([np.full(3, points[k].sigma) for k in order]).reshape(-1, 3)
+    ones = np.ones(len(order), dtype=int)
+    return Rows("survey", "position", at, at, z, np.zeros((len(order), 0)), sigma, slice(0, 0), ones)
 
 
 def velocity_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], sigma: Floats) -> Rows:

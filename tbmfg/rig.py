@@ -303,13 +303,21 @@ class Barometer(Sensor):
     sigma_m: Positive = Field(0.2, description="White noise of the height, per sample.")
     bias_sd_m: CalibrationSd = Field(10.0, description="Of the bias at the start; 0 or null: not estimated.")
     bias_walk: NotNegative = Field(0.01, description="Random walk of the bias, m/sqrt(s).")
-    scale_sd: CalibrationSd = Field(0.0, description="Of the scale of height; 0 or null: not estimated.")
+    air_c: Number | None = Field(None, description="Temperature of the air column; null: the standard atmosphere's.")
+    scale_sd: CalibrationSd = Field(
+        0.0, description="Of the scale of height, 0.0035 for each degree that air_c may be wrong; 0 or null: known."
+    )
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
     sigma = si("sigma_m")
     bias_sd = si("bias_sd_m")
     clock_offset = si("clock_offset_s")
+
+    def scale_at(self, height_m: float) -> float:
+        """Scale of pressure heights about ``height_m`` in the standard atmosphere: warm air is thin, so they are short;
+        ISO 2533, 288.15 K at sea level and 6.5 K less each km up."""
+        return 0.0 if self.air_c is None else (288.15 - 0.0065 * height_m) / (273.15 + self.air_c) - 1.0
 
 
 class Laser(Sensor):

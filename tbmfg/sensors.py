@@ -193,15 +193,20 @@ def magnetometer(z, data, xi, xj, c):
 
 @njit(cache=True)
 def barometer(z, data, xi, xj, c):
-    """Pressure height: h = p_z + v_z lag + bias. z (1) [m]; data (2): mean lag [s], index of the bias among
-    the drifting calibrations; c (0)."""
+    """Pressure height: h = z + s (z - z_0) + bias with z = p_z + v_z lag.
+
+    z (1) [m]; data (3): mean lag [s], index of the bias among the drifting calibrations, z_0 [m] at which the bias is
+    counted; c (1): scale s, which is the air's density against the one that pressure was turned into height with.
+    """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji = np.empty((n, 1)), np.zeros((n, 1, d))
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 1))
     for k in range(n):
         x, drift = xi[k], int(data[k, 1])
-        r[k, 0] = x[11] + x[14] * data[k, 0] + x[21 + drift] - z[k, 0]
-        Ji[k, 0, 5], Ji[k, 0, 8], Ji[k, 0, 15 + drift] = 1.0, data[k, 0], 1.0
-    return r, Ji, np.zeros((n, 1, 0)), np.zeros((n, 1, 0))
+        height = x[11] + x[14] * data[k, 0]
+        r[k, 0] = height + c[0] * (height - data[k, 2]) + x[21 + drift] - z[k, 0]
+        Ji[k, 0, 5], Ji[k, 0, 8], Ji[k, 0, 15 + drift] = 1.0 + c[0], (1.0 + c[0]) * data[k, 0], 1.0
+        Jc[k, 0, 0] = height - data[k, 2]
+    return r, Ji, np.zeros((n, 1, 0)), Jc
 
 
 @njit(cache=True)
@@ -239,6 +244,16 @@ def laser(z, data, xi, xj, c):
                 Ji[row, a, b], Ji[row, a, 3 + b], Ji[row, a, 6 + b] = turn[b], across_n[b], across_n[b] * lag
             Jc[row, a, 0], Jc[row, a, 1], Jc[row, a, 2 + a] = -s * across_n[0], -s * across_n[1], 1.0
     return r, Ji, np.zeros((n, 2, 0)), Jc
+
+
+@njit(cache=True)
+def position(z, data, xi, xj, c):
+    """Position of b in n [m]: z (3), a surveyed point."""
+    n, d = len(z), xi.shape[1] - 6
+    Ji = np.zeros((n, 3, d))
+    for a in range(3):
+        Ji[:, a, 3 + a] = 1.0
+    return xi[:, 9:12] - z, Ji, np.zeros((n, 3, 0)), np.zeros((n, 3, 0))
 
 
 @njit(cache=True)
@@ -315,7 +330,8 @@ def lidar(z, data, xi, xj, c):
 
 
 MODELS: dict[str, Callable] = {
-    f.__name__: f for f in (prism, odometer, wheel, magnetometer, barometer, laser, velocity, rotation, bounded, lidar)
+    f.__name__: f
+    for f in (prism, odometer, wheel, magnetometer, barometer, laser, position, velocity, rotation, bounded, lidar)
 }
 
 

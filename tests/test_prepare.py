@@ -336,8 +336,14 @@ def test_an_imu_away_from_its_own_origin_is_refused():
         prepared(simulation, "sensors.imu.T_bi.xyz_m=[0.1, 0, 0]")
 
 
-def test_what_no_estimator_does_yet_is_said():
+def test_a_keyframe_lies_at_every_surveyed_point():
     simulation = flight(0, 6.0)
-    point = "survey=[{at: end, position_m: [0, 0, 0], sigma_m: 0.01}]"
-    problem = prepare(log_of(simulation.log_series), override(simulation.rig, [point]))
-    assert any("survey" in line and "not used" in line for line in problem.warnings)
+    points = ("at: end, position_m: [3, 2, 1]", "at: start, position_m: [1, 2, 3]", "at: 2.22, position_m: [2, 2, 2]")
+    survey = f"survey=[{', '.join(f'{{{point}, sigma_m: 0.01}}' for point in points)}]"
+    problem = prepared(simulation, survey)
+    rows = next(rows for rows in problem.rows if rows.sensor == "survey")
+    half_a_sample = 0.5 * problem.inertial.steps.period_s
+    assert_allclose(problem.keyframes_s[rows.i], [0.0, 2.22, problem.keyframes_s[-1]], atol=half_a_sample + 0.005)
+    assert_allclose(rows.z + problem.origin_n, [[1, 2, 3], [2, 2, 2], [3, 2, 1]])
+    with pytest.raises(RigError, match=r"survey\.0\.at: 7 s is outside the log"):
+        prepared(simulation, "survey=[{at: 7, position_m: [0, 0, 0], sigma_m: 1}]")

@@ -38,7 +38,8 @@ CASES = {
     "wheel": ([1.3], [-0.4, 0.3, -1.1, 0.7, -1.1, 0.9, 1.1], [0.07, 0.21, -0.13], 10.0),
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
     "magnetometer": ([14.0, -17.0, -31.0], [0.4], [0.05], 20.0),
-    "barometer": ([11.2], [0.04, 1.0], [], 20.0),
+    "barometer": ([11.2], [0.04, 1.0, 3.0], [0.02], 20.0),
+    "position": ([39.0, -69.0, 11.0], [], [], 80.0),
     # tilted by some 20 degrees, 15 m above z = 0: third derivatives grow as the distance over cos^4
     "laser": (
         [0.3, -0.2],
@@ -55,6 +56,7 @@ CALIBRATIONS = {
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination"],
+    "barometer": ["scale"],
     "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
 
@@ -249,8 +251,9 @@ def test_magnetometer_at_truth_and_across_the_branch_cut():
 
 
 def test_barometer_bound_and_velocity_at_truth():
-    height = X_I[11] + 0.04 * X_I[14] + X_I[22]
-    residual, *_ = sensors.barometer(np.array([[height]]), np.array([[0.04, 1.0]]), X_I[None], X_I[None], np.zeros(0))
+    above = X_I[11] + 0.04 * X_I[14] - 3.0
+    height, data = 3.0 + 1.02 * above + X_I[22], np.array([[0.04, 1.0, 3.0]])
+    residual, *_ = sensors.barometer(np.array([[height]]), data, X_I[None], X_I[None], np.array([0.02]))
     assert residual[0, 0] == pytest.approx(0.0, abs=4 * EPS * 12)
     for model, z in (("velocity", X_I[12:15]), ("bounded", X_I[9:15])):
         residual, *_ = MODELS[model](z[None], np.zeros((1, 0)), X_I[None], X_I[None], np.zeros(0))

@@ -13,7 +13,7 @@ from tbmfg.errors import EstimationError
 from tbmfg.estimators import estimate
 from tbmfg.filters import ins
 from tbmfg.inertial.strapdown import correct_states, propagate
-from tbmfg.problem import GATE
+from tbmfg.problem import GATE, Parameters
 from tbmfg.sensors import Rows
 from tbmfg.smoother import batch, graph, losses
 from tests.problems import ERRORS, flight_problem, gtsam_graph, gtsam_marginal, native_problem, state_errors, worst
@@ -298,7 +298,8 @@ def barometer_rows(problem, truth_z, bias, rng):
     n = len(problem.keyframe_edges)
     k, one = np.arange(n), np.ones(n, dtype=int)
     z = (truth_z + bias + 0.1 * rng.standard_normal(n))[:, None]
-    return Rows("barometer", "barometer", k, k, z, np.zeros((n, 2)), np.full((n, 1), 0.1), slice(0, 0), one)
+    scale = slice(len(problem.parameters.names), len(problem.parameters.names) + 1)
+    return Rows("barometer", "barometer", k, k, z, np.zeros((n, 3)), np.full((n, 1), 0.1), scale, one)
 
 
 def test_a_drifting_bias_is_followed():
@@ -308,12 +309,16 @@ def test_a_drifting_bias_is_followed():
     walk, dt = 0.3, np.diff(plain.keyframes_s)
     bias = 2.0 + np.concatenate([[0.0], np.cumsum(walk * np.sqrt(dt) * rng.standard_normal(n - 1))])
     height = solved(plain).x[:, 11]
-    prior = plain.prior
+    prior, known = plain.prior, plain.parameters
+    known = Parameters(
+        (*known.names, "barometer.scale"), *(np.append(v, 0.0) for v in (known.mean, known.sd, known.start))
+    )
     cov = np.zeros((16, 16))
     cov[:15, :15], cov[15, 15] = prior.cov, 5.0**2
     problem = replace(
         plain,
         rows=[*plain.rows, barometer_rows(plain, height, bias, rng)],
+        parameters=known,
         drift_names=("barometer.bias",),
         drift_walk=np.array([walk]),
         prior=replace(prior, x=np.append(prior.x, 0.0), cov=cov, filter_cov=cov),

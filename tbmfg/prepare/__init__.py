@@ -41,7 +41,7 @@ def prepare(
         if name not in rig.sensors:
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
     log, rig, said = gnss.into_n(log, rig)
-    warnings: list[str] = [*log.damage, *losses(log, rig, without), *said, *_without_model(rig)]
+    warnings: list[str] = [*log.damage, *losses(log, rig, without), *said]
     steps, imu_counts = imu_steps(log, rig, outages, warnings)
     missing: list[str] = []
     samples, counts = usable_samples(log, rig, steps, outages, without, missing)
@@ -69,13 +69,3 @@ def prepare(
     ]
     tell("prepare", 1.0)
     return problem
-
-
-def _without_model(rig: Rig) -> list[str]:
-    """What the rig asks for and no estimator does yet."""
-    lines = [f"survey: its {len(rig.survey)} points are not used yet"] if rig.survey else []
-    return lines + [
-        f"{name}.scale_sd: the scale of a barometer is not estimated yet"
-        for name, sensor in rig.of_kind("barometer").items()
-        if sensor.scale_sd > 0
-    ]

@@ -36,9 +36,11 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
 
     fixes = [s.t_s - offsets[name] for name, s in samples.items() if is_position(rig, name)]
     scans = [s.t_s for name, s in samples.items() if isinstance(rig.sensors[name], Lidar)]
-    fixes_s = np.sort(np.concatenate([*fixes, *scans])) if fixes or scans else np.zeros(0)
+    surveyed = measure.survey_times(rig.survey, steps)
+    fixes_s = np.sort(np.concatenate([*fixes, *scans, surveyed]))
     edges = measure.keyframe_edges(rig.keyframes, steps.edges_s, end_s, fixes_s)
     keyframes = steps.edges_s[edges]
+    position, velocity = first_state(setup, offsets)
     rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
     for name, s in samples.items():
         sensor, calib = rig.sensors[name], parameters.slice(name)
@@ -57,7 +59,9 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
                 )
             )
         elif isinstance(sensor, Barometer):
-            rows.append(measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names)))
+            rows.append(
+                measure.barometer_rows(sensor, s, keyframes, setup.origin_n, len(drift_names), position[2], calib)
+            )
             drift_names.append(f"{name}.bias")
             drift_walk.append(sensor.bias_walk)
             drift_sd.append(max(sensor.bias_sd, 1e-6))
@@ -67,7 +71,8 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
         rows.append(measure.velocity_rows(keyframes, standing.intervals, np.full(3, speed)))
         turned = measure.rotation_rows(keyframes, standing.intervals, rig.zero_velocity.turn, standing.angle)
         rows += [turned] if len(turned) else []
-    position, velocity = first_state(setup, offsets)
+    if len(marks := measure.survey_rows(rig.survey, surveyed, keyframes, setup.origin_n)):
+        rows.append(marks)
     if rig.motion is not None:
         rows.append(measure.bounded_rows(keyframes, position, rig.motion.radius, rig.motion.speed))
     if not any(kind_of(r.sensor) not in ("zero_velocity", "zero_rotation") for r in rows):
@@ -81,7 +86,7 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
     )  # fmt: skip
     drift = np.array(drift_start) - setup.origin_n[2] - position[2] if drift_names else np.zeros(0)
     x = np.concatenate([setup.R_start.ravel(), position, velocity, np.zeros(3), setup.bias_gyro, drift])
-    prior = prior_of(setup, x, np.array(drift_sd), bool(fixes))
+    prior = prior_of(setup, x, np.array(drift_sd), bool(fixes) or "start" in [point.at for point in rig.survey])
     return Problem(
         rig, inertial, edges, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
         dict(offsets), samples, setup.counts, {}, [], setup.warnings,
@@ -89,7 +94,8 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
 
 
 def first_state(setup: Setup, offsets: dict[str, float]) -> tuple[Floats, Floats]:
-    """Position (from the origin) and velocity in n at the first edge: from the rig, else from the first fixes."""
+    """Position (from the origin) and velocity in n at the first edge: from the rig, else from the first fixes,
+    else from a point surveyed at the start."""
     rig = setup.rig
     position, velocity = rig.initial.position, rig.initial.velocity
     for name, s in setup.samples.items():
@@ -102,6 +108,8 @@ def first_state(setup: Setup, offsets: dict[str, float]) -> tuple[Floats, Floats
         position = fit[0] - setup.R_start @ rig.sensors[name].arm if position is None else position
         velocity = fit[1] if velocity is None and degree else velocity
         break
+    for point in rig.survey:
+        position = point.position if position is None and point.at == "start" else position
     position = np.zeros(3) if position is None else position - setup.origin_n
     return position, np.zeros(3) if velocity is None else velocity
 

@@ -15,7 +15,7 @@ from tbmfg.prepare import rest
 from tbmfg.prepare.rest import Rest
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import Parameters
-from tbmfg.rig import Laser, Lidar, Magnetometer, Odometer, PositionSensor, Rig
+from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, Rig
 from tbmfg.state import Counts
 from tbmfg.timeseries import Floats
 
@@ -189,6 +189,8 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
         elif isinstance(sensor, Lidar):
             entries += [(f"{name}.mount_{axis}", sensor.T_bl.xyz[k], sensor.xyz_sd) for k, axis in enumerate("xyz")]
             entries += [(f"{name}.turn_{axis}", 0.0, sensor.rpy_sd) for axis in "xyz"]
+        elif isinstance(sensor, Barometer):
+            entries += [(f"{name}.scale", sensor.scale_at(float(np.median(samples[name].values))), sensor.scale_sd)]
         elif isinstance(sensor, Laser):
             entries += [(f"{name}.tilt_{axis}", sensor.tilt[k], sensor.tilt_sd) for k, axis in enumerate("xy")]
             entries += [(f"{name}.offset_{axis}", 0.0, sensor.offset_sd) for axis in "xy"]

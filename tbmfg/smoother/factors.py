@@ -27,6 +27,7 @@ PARTS = {
     "magnetometer": ("X", ""),
     "barometer": ("XVD", ""),
     "laser": ("XV", ""),
+    "position": ("X", ""),
     "bounded": ("XV", ""),
     "lidar": ("XV", "XV"),
     "rotation": ("X", "X"),

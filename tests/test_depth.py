@@ -1,0 +1,50 @@
+"""Depth by air pressure: a cage in a shaft whose air is warmer than its thermometer says, simulated independently."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import datasets
+from tbmfg.estimators import estimate
+from tbmfg.prepare import prepare
+from tbmfg.rig import override
+from tests.problems import log_of
+
+SETTINGS = ("sensors.imu.noise_factor=1",)
+
+
+@cache
+def ride(seed: int, survey_sd_m: float):
+    options = {"vibration": 0.0, "survey_sd_m": survey_sd_m, "air_sd_k": 2.0}
+    return datasets.make("cage-fast", seed=seed, duration=40.0, **options)
+
+
+def depth(simulation, estimator: str):
+    """Result, and its error and sd of the last height [m]."""
+    problem = prepare(log_of(simulation.log_series), override(simulation.rig, SETTINGS))
+    result = estimate(estimator, problem)
+    path = result.trajectory
+    true = simulation.truth((path.t_ns - simulation.start_ns) * 1e-9).position[:, 2]
+    return result, path.position_n[-1, 2] - true[-1], np.sqrt(path.cov[-1, 5, 5]), np.ptp(true)
+
+
+@pytest.mark.parametrize("estimator", ["batch", "ins"])
+def test_a_point_surveyed_at_the_bottom_tells_the_scale(estimator):
+    simulation = ride(1, 0.05)
+    result, error, sd, way = depth(simulation, estimator)
+    assert abs(error) < 4.0 * sd
+    assert sd < 0.06
+    scale = result.calibration["barometer_scale"]
+    # pressure falls with height as the air is dense: scale against 288.15 K at the height the readings seem to be at
+    air_k = simulation.drawn["barometer"]["air_k"]
+    assert scale.estimated
+    assert abs(scale.value - (288.15 / air_k - 1.0)) < 4.0 * scale.sd + 0.001
+    assert way > 20.0
+
+
+def test_without_a_reference_depth_is_said_to_hang_on_the_temperature():
+    result, error, sd, way = depth(ride(1, 0.0), "batch")
+    assert 0.5 * 0.007 * way < sd
+    assert abs(error) < 4.0 * sd
+    assert any("depth is limited by the air's temperature" in line for line in result.warnings)
