@@ -13,7 +13,9 @@ from tbmfg.inertial.steps import compensate, make_steps
 from tbmfg.inertial.strapdown import (
     correct_state,
     correct_states,
+    difference,
     exp_rotation,
+    log_rotation,
     mechanise,
     propagate,
     rotations,
@@ -327,3 +329,21 @@ def test_compensation_is_done_at_the_biases_and_leaves_them_in():
         strict=True,
     ):
         assert_allclose(shifted - bias, plain, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-13, 1e-8, 1e-3, 1.0, 2.5, np.pi - 1e-6, np.pi])
+def test_log_is_the_inverse_of_exp(angle):
+    rng = np.random.default_rng(0)
+    for axis in [*np.eye(3), *-np.eye(3), *rng.standard_normal((20, 3))]:
+        turn = angle * axis / np.linalg.norm(axis)
+        found = log_rotation(exp_rotation(turn))
+        # near a half turn the axis is what the matrix says of it, to the square root of rounding, and its sign is free
+        assert_allclose(exp_rotation(found), exp_rotation(turn), atol=20 * EPS)
+        assert np.linalg.norm(found) == pytest.approx(angle, abs=1e-7 if angle > 3 else 20 * EPS)
+
+
+def test_difference_undoes_a_correction():
+    rng = np.random.default_rng(1)
+    x0 = np.tile(np.append(X0, [0.4, -0.2]), (5, 1))
+    d = rng.standard_normal((5, 17))
+    assert_allclose(difference(correct_states(x0, d), x0), d, atol=1e-13)

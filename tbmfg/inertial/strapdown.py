@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tbmfg.geometry import log_so3
-
 R_, P_, V_, BA_, BG_ = slice(0, 9), slice(9, 12), slice(12, 15), slice(15, 18), slice(18, 21)
 STATE = 21
 
@@ -182,7 +180,34 @@ def correct_states(x: np.ndarray, d: np.ndarray) -> np.ndarray:
     return out
 
 
+@njit(cache=True)
+def log_rotation(R: np.ndarray) -> np.ndarray:
+    """Log of one rotation matrix (3, 3) -> (3,), norm at most pi; by the quaternion's largest part (Shepperd 1978)."""
+    parts = np.array([R[0, 0] + R[1, 1] + R[2, 2], R[0, 0], R[1, 1], R[2, 2]])
+    largest = np.argmax(parts)
+    q = np.empty(4)  # w, x, y, z, times a common factor
+    if largest == 0:
+        q[0] = 1.0 + parts[0]
+        q[1], q[2], q[3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i = largest - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0] = R[k, j] - R[j, k]
+        q[1 + i] = 1.0 - parts[0] + 2.0 * R[i, i]
+        q[1 + j], q[1 + k] = R[j, i] + R[i, j], R[k, i] + R[i, k]
+    if q[0] < 0.0:
+        q = -q
+    sine = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    factor = 2.0 / q[0] if sine < 1e-12 * q[0] else 2.0 * np.arctan2(sine, q[0]) / sine
+    return factor * q[1:]
+
+
+@njit(cache=True)
 def difference(x: np.ndarray, x0: np.ndarray) -> np.ndarray:
     """x (-) x0, the inverse of ``correct_states``: (n, 21 + e) each -> (n, 15 + e)."""
-    R, R0 = x[:, :9].reshape(-1, 3, 3), x0[:, :9].reshape(-1, 3, 3)
-    return np.hstack([log_so3(np.swapaxes(R0, 1, 2) @ R), x[:, 9:] - x0[:, 9:]])
+    out = np.empty((len(x), x.shape[1] - 6))
+    for k in range(len(x)):
+        R, R0 = x[k, :9].copy().reshape(3, 3), x0[k, :9].copy().reshape(3, 3)
+        out[k, :3] = log_rotation(_mul(R0.T.copy(), R))
+        out[k, 3:] = x[k, 9:] - x0[k, 9:]
+    return out

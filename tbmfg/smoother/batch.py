@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states
-from tbmfg.problem import GATE, Problem
+from tbmfg.problem import Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
@@ -44,7 +43,7 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
     """
     descent = _Descent(problem, States(x.copy(), c.copy()), progress)
     converged = descent.run(MAX_ITERATIONS)
-    doubted = [r for r in problem.rows if r.loss == "gnc" and (descent.nis[r.sensor] > chi2.ppf(GATE, r.dof)).any()]
+    doubted = [r for r in problem.rows if r.loss == "gnc" and (descent.nis[r.sensor] > losses.gate(r.dof)).any()]
     if doubted:
         mu = min(losses.first_mu(descent.nis[r.sensor], r.dof) for r in doubted)
         while mu < losses.LAST_MU and not descent.decided(doubted, mu):

@@ -8,6 +8,8 @@ and goes over to the truncated one.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -18,9 +20,16 @@ GROWTH = 2.0  # of mu from stage to stage
 LAST_MU = 1e3  # the loss is the truncated square to a part in 1000
 
 
+@cache
 def threshold(dof: int) -> float:
     """Normalised residual from which Huber and Cauchy depart from the square: 95 % of good rows lie below."""
     return float(np.sqrt(chi2.ppf(0.95, dof)))
+
+
+@cache
+def gate(dof: int) -> float:
+    """Squared normalised residual beyond which a row is gated, and truncated squares end."""
+    return float(chi2.ppf(GATE, dof))
 
 
 def weight(nis: Floats, loss: str, dof: int, mu: float | None = None) -> Floats:
@@ -29,7 +38,7 @@ def weight(nis: Floats, loss: str, dof: int, mu: float | None = None) -> Floats:
         return np.ones_like(nis)
     s = np.sqrt(nis)
     if loss == "gnc" and mu is not None:
-        c = np.sqrt(chi2.ppf(GATE, dof))
+        c = np.sqrt(gate(dof))
         return np.clip(c / np.maximum(s, 1e-9) * np.sqrt(mu * (mu + 1.0)) - mu, 0.0, 1.0)  # eq. (14)
     k = threshold(dof)
     if loss == "huber":
@@ -43,7 +52,7 @@ def cost(nis: Floats, loss: str, dof: int, mu: float | None = None) -> float:
         return 0.5 * float(nis.sum())
     s = np.sqrt(nis)
     if loss == "gnc" and mu is not None:
-        square = chi2.ppf(GATE, dof)
+        square = gate(dof)
         between = 2.0 * np.sqrt(square) * s * np.sqrt(mu * (mu + 1.0)) - mu * (square + nis)  # eq. (12)
         good, bad = nis <= mu / (mu + 1.0) * square, nis >= (mu + 1.0) / mu * square
         return 0.5 * float(np.sum(np.where(good, nis, np.where(bad, square, between))))
@@ -55,5 +64,5 @@ def cost(nis: Floats, loss: str, dof: int, mu: float | None = None) -> float:
 
 def first_mu(nis: Floats, dof: int) -> float:
     """Where to begin so that every row still counts; eq. (12) ff."""
-    square = chi2.ppf(GATE, dof)
+    square = gate(dof)
     return float(square / max(2.0 * nis.max() - square, square))

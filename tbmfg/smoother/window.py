@@ -13,11 +13,10 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from scipy.stats import chi2
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
-from tbmfg.problem import GATE, Problem
+from tbmfg.problem import Problem
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, marginal
 from tbmfg.smoother.graph import States
@@ -96,7 +95,7 @@ class _Window:
             r, J, *_ = rows.evaluate_at(x, x, self.c, own)
             S = J @ cov @ J.transpose(0, 2, 1) + np.eye(rows.dof)
             nis = np.einsum("ni,nij,nj->n", r, np.linalg.inv(S), r)
-            self.out[rows.sensor][own] = nis > chi2.ppf(GATE, rows.dof)
+            self.out[rows.sensor][own] = nis > losses.gate(rows.dof)
 
     def leave(self, count: int, out: Online) -> None:
         """Let the oldest ``count`` keyframes leave, one at least stays; kept in ``out`` as they were solved last."""
