@@ -107,12 +107,23 @@ def _common(
 
 
 @app.command()
-def info(log: Log, debug: Debug = False) -> None:
+def info(
+    log: Log,
+    allan: Annotated[
+        bool, typer.Option("--allan", help="Noise of the IMU by Allan variance over its longest standstill.")
+    ] = False,
+    rig: Annotated[
+        str | None, typer.Option(metavar="NAME|FILE", help="Of --allan: else the log's rig, else a guess.")
+    ] = None,
+    debug: Debug = False,
+) -> None:
     """Topics, roles, rates, gaps and clock problems of a log."""
     with _errors_in_one_line(debug):
         from tbmfg.mcap import info_text
 
         typer.echo(info_text(log))
+        if allan:
+            _print_allan(log, rig)
 
 
 @app.command()
@@ -333,6 +344,20 @@ def _progress_bar(first: str) -> Iterator[Callable[[str, float], None] | None]:
 
 
 # ---- printing ----
+
+
+def _print_allan(log: str, rig: str | None) -> None:
+    """What the standing IMU shows of its noise, beside what the rig says of it."""
+    from tbmfg import pipeline
+    from tbmfg.inertial.allan import against_rig
+
+    found, imu = pipeline.allan(log, rig)
+    typer.echo(f"\nAllan variance, standing from {found.start_s:.1f} to {found.end_s:.1f} s")
+    rows = [
+        (name, "not seen" if value is None else _number(value), _number(said))
+        for name, value, said in against_rig(found, imu)
+    ]
+    _print_table(["", "found", "rig"], rows, justify="right")
 
 
 def _print_summary(summary: dict[str, Any], output: str) -> None:

@@ -25,12 +25,13 @@ from tbmfg.results import (
     write_result,
     write_text,
 )
-from tbmfg.rig import Rig, dump_rig, load_rig, override, parse_rig
+from tbmfg.rig import Imu, Rig, dump_rig, load_rig, override, parse_rig
 from tbmfg.state import Calibrated, Result, Truth
 from tbmfg.timeseries import NS, Log
 
 if TYPE_CHECKING:
     from tbmfg.bounds import Bounds
+    from tbmfg.inertial.allan import Static
     from tbmfg.problem import Problem
     from tbmfg.report import Report
     from tbmfg.storage import Place
@@ -366,6 +367,18 @@ def init(log_path: str | Place, output: str | Place, *, force: bool = False) -> 
     inferred = infer(log)
     write_text(output, starter(inferred, log.path), force=force)
     return [*log.damage, *inferred.lines()]
+
+
+def allan(log_path: str | Place, rig: Rig | str | Path | None = None) -> tuple[Static, Imu]:
+    """Noise of the IMU where it stands, and what the rig (given, attached or inferred) says of the unit."""
+    from tbmfg.inertial.allan import static
+    from tbmfg.mcap import read_log
+    from tbmfg.prepare.samples import imu_steps
+
+    log = read_log(log_path)
+    rig = given_rig(rig, log.attachments, log.path) or inferred_rig(log)[0]
+    steps, _ = imu_steps(log, rig, (), [])
+    return static(steps), rig.imu
 
 
 def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -> tuple[str, ...]:

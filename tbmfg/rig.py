@@ -153,6 +153,21 @@ class Sensor(Node):
     topic: Text = Field(description="Topic in the log.")
 
 
+class Enhancement(Node):
+    """Inertial enhancement against vibration, for every estimator alike; an online one lags by a window then."""
+
+    emd_threshold: Literal["noise", "kept", "off"] = Field(
+        "noise",
+        description="Modes that are thresholded; kept: as printed, which deletes motion; off: no decomposition.",
+    )
+    window_s: Positive = Field(4.0, description="Of the decomposition; windows overlap by half.")
+    alpha_bar: Annotated[Number, Field(ge=0, le=1)] = Field(
+        0.001, description="Gain of the tilt by gravity per sample of 475 Hz; 1: as printed; 0: off."
+    )
+
+    window = si("window_s")
+
+
 class Imu(Sensor):
     """Inertial unit; required. Defaults describe an industrial MEMS unit on a machine."""
 
@@ -170,6 +185,11 @@ class Imu(Sensor):
     acc_bias_sd_mps2: Positive = Field(0.2, description="Of the bias at the start, m/s^2; 0.2 is 20 mg.")
     noise_factor: NoiseFactor = Field(
         1.0, description="Multiplies both densities; auto: found from the log (vibration makes data sheets optimistic)."
+    )
+    enhancement: Enhancement | None = Field(
+        None,
+        description="{emd_threshold: noise, kept or off; window_s: 4; alpha_bar: 0.001}: vibration taken out by "
+        "empirical mode decomposition, tilt held by gravity; {}: with these values; null: not at all.",
     )
 
     gyro_density = si("gyro_density_dps_rthz", DEG)

@@ -36,7 +36,7 @@ ONLY = {"evaluation": {"errors", "timeseries", "geometry", "state"}}
 # The simulators share the vocabulary of tbmfg and none of the equations that they put to the test.
 DATASETS_SEE = {"errors", "timeseries", "yamltext", "geometry", "earth", "state", "rig", "mcap"}
 
-HEAVY = {"gtsam", "numba", "scipy", "open3d", "plotly", "dask", "distributed", "kiss_icp", "small_gicp"}
+HEAVY = {"gtsam", "numba", "scipy", "open3d", "plotly", "dask", "distributed", "kiss_icp", "small_gicp", "PyEMD"}
 
 
 def imported(source: str) -> set[str]:

@@ -1,7 +1,7 @@
 """From a log and a rig to the problem that every estimator solves: once per log, alike for all.
 
-Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, the clock offset and the
-noise factor of the IMU, found from the log itself.
+Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, inertial enhancement, and the clock
+offset and the noise factor of the IMU, found from the log itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from tbmfg import gnss
 from tbmfg.errors import EstimationError, RigError
 from tbmfg.inertial.steps import to_ns
-from tbmfg.prepare import magnetic, scans, search
+from tbmfg.prepare import enhance, magnetic, scans, search
 from tbmfg.prepare.samples import ALONE, imu_steps, is_position, losses, usable_samples
 from tbmfg.prepare.start import align, parameters_of
 from tbmfg.problem import Problem, breakdown_explained
@@ -43,6 +43,7 @@ def prepare(
     log, rig, said = gnss.into_n(log, rig)
     warnings: list[str] = [*log.damage, *losses(log, rig, without), *said]
     steps, imu_counts = imu_steps(log, rig, outages, warnings)
+    steps = enhance.denoised(rig, steps, warnings)
     missing: list[str] = []
     samples, counts = usable_samples(log, rig, steps, outages, without, missing)
     lidars = scans.present(log, rig, without)
@@ -52,13 +53,14 @@ def prepare(
     counts = {"imu": imu_counts, **counts}
     with breakdown_explained("preparing the estimate"):
         setup = align(rig, steps, samples, counts, warnings)
+        told = enhance.levelled(setup)
         for name in lidars:
             scans.register(log, name, setup, outages, lambda share: tell("LiDAR odometry", share))
         setup.parameters = parameters_of(rig, setup.samples)
         delays = magnetic.onto_gyro_clock(setup)
         offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
         problem = search.find(setup, offsets, tell)
-        problem.calibration |= delays
+        problem.calibration |= told | delays
     problem.intervals = [
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),

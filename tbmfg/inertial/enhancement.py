@@ -1,0 +1,141 @@
+"""Inertial enhancement: vibration taken out of the samples by empirical mode decomposition, tilt held by gravity.
+
+Liu, Wang & Tao (TBM-MSE), section 2, corrected; (n) are its equations, E its errata. Its z axes point down; here they
+point up, so what it calls the predicted down, -C f / |f|, is up with the other sign.
+
+Smoothed samples are no longer the truth plus white noise: what was taken away may have been motion. Of that the filters
+are told as noise, see :func:`changed_density`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numba import njit
+
+from tbmfg.inertial.steps import Steps
+from tbmfg.inertial.strapdown import exp_rotation
+from tbmfg.timeseries import Floats
+
+Rule = Literal["noise", "kept"]
+
+GAUSS = 0.6745  # median of |x| over sd of a normal distribution
+SAMPLE_HZ = 475.0  # the rate for which the correction's gain per sample is stated
+SHORTEST = 16  # samples of a window that can be decomposed
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """What an enhancement did to the gyro [rad/s] and the accelerometer [m/s^2]: ``rms`` of the change per axis, and
+    the white ``density`` [unit/sqrt(Hz)] that it leaves in the filters' model."""
+
+    rms: tuple[float, float]
+    density: tuple[float, float]
+
+
+def denoise(steps: Steps, rule: Rule, window_s: float) -> tuple[Steps, Changed]:
+    """Steps with every axis through :func:`smooth`; their extra noise is that of :func:`changed_density`."""
+    size = 2 * max(SHORTEST, round(0.5 * window_s / steps.period_s))
+    smoothed = [
+        np.stack([smooth(values[:, axis], rule, size) for axis in range(3)], axis=1)
+        for values in (steps.gyro, steps.acc)
+    ]
+    parts = [new - old for new, old in zip(smoothed, (steps.gyro, steps.acc), strict=True)]
+    density = [changed_density(part, steps.period_s, size) for part in parts]
+    found = replace(
+        steps, gyro=smoothed[0], acc=smoothed[1],
+        extra_gyro=steps.extra_gyro + density[0] ** 2, extra_acc=steps.extra_acc + density[1] ** 2,
+    )  # fmt: skip
+    return found, Changed(tuple(float(np.sqrt(np.mean(part**2))) for part in parts), tuple(density))
+
+
+def smooth(x: Floats, rule: Rule, size: int) -> Floats:
+    """x (n,) through :func:`threshold` in windows of ``size`` samples, each half over the next and faded into it.
+
+    A value is final when the last window that holds it is full: the step is not causal, it lags by up to a window.
+    """
+    half = size // 2
+    fade = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    total, weight = np.zeros(len(x)), np.zeros(len(x))
+    for first in range(-half, len(x), half):
+        begin, end = max(first, 0), min(first + size, len(x))
+        if end - begin < SHORTEST:
+            continue
+        share = fade[begin - first : end - first]
+        total[begin:end] += share * threshold(x[begin:end], rule)
+        weight[begin:end] += share
+    return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), x)
+
+
+def threshold(x: Floats, rule: Rule) -> Floats:
+    """(1)-(7): one window without its noise. ``noise``: of the modes faster than the one of least energy only what
+    stands out is kept (E3); ``kept``: those are dropped and the others thresholded, as printed."""
+    from PyEMD import EMD
+
+    emd = EMD()
+    emd.emd(x)
+    modes, rest = emd.get_imfs_and_residue()
+    if len(modes) < 2:
+        return x
+    M = int(np.argmin(np.mean(modes[:-1] ** 2, axis=1)))  # (2), (3): the mode of least energy (E1)
+    if rule == "kept":
+        return sum(map(intervals, modes[M:]), rest)
+    return sum(map(intervals, modes[:M]), modes[M:].sum(axis=0) + rest)
+
+
+def intervals(mode: Floats) -> Floats:
+    """(5)-(7): soft threshold of the oscillations of a mode (n,), each between zero crossings, by its peak."""
+    T = np.median(np.abs(mode)) / GAUSS * np.sqrt(2.0 * np.log(len(mode)))
+    starts = np.concatenate([[0], np.flatnonzero(np.signbit(mode[1:]) != np.signbit(mode[:-1])) + 1])
+    peak = np.maximum.reduceat(np.abs(mode), starts)
+    share = np.where(peak > T, 1.0 - T / np.maximum(peak, np.finfo(float).tiny), 0.0)
+    return mode * np.repeat(share, np.diff(np.append(starts, len(mode))))
+
+
+def changed_density(change: Floats, period_s: float, size: int) -> float:
+    """White density, unit/sqrt(Hz), rms over the axes, of what a change (n, 3) of the samples does in the long run.
+
+    A filter integrates its samples; vibration that was taken away integrates to nothing, motion and noise do not. Means
+    under a Hann window of ``size`` samples keep what is slower than that, and S sum(w^2) dt / (sum(w) dt)^2 is their
+    variance for a white noise of density S.
+    """
+    size = min(size, len(change))
+    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    firsts = range(0, len(change) - size + 1, max(1, size // 2))
+    means = np.array([window @ change[first : first + size] for first in firsts]) / window.sum()
+    return float(np.sqrt(np.mean(means**2) * window.sum() ** 2 * period_s / np.sum(window**2)))
+
+
+# ---- tilt ----
+
+
+def gravity_correction(
+    steps: Steps, gyro: Floats, acc: Floats, R_start: Floats, bias_gyro: Floats, earth_n: Floats, g: float, gain: float
+) -> Floats:
+    """(13)-(15): rates [rad/s] (n, 3), to be added to ``gyro``, that turn the attitude by a share of the angle between
+    the specific force and the vertical, from ``R_start`` at the first edge on.
+
+    ``gyro``, ``acc`` (n, 3) are compensated; ``gain`` is the share per sample of 475 Hz while |f| is gravity (E8; 1: as
+    printed). Heading is not touched. The Earth's rate is in the attitude (E5): else it would be corrected away.
+    """
+    return _gravity_correction(steps.dt, gyro - bias_gyro, acc, R_start, earth_n, g, gain)
+
+
+@njit(cache=True)
+def _gravity_correction(dt, gyro, acc, R_start, earth_n, g, gain):
+    out = np.empty_like(gyro)
+    R = R_start.copy()
+    for k in range(len(gyro)):
+        R = exp_rotation(-earth_n * dt[k]) @ R @ exp_rotation(gyro[k] * dt[k])
+        size = np.sqrt(np.sum(acc[k] ** 2))
+        up = R @ acc[k] / max(size, 1e-9)
+        e = np.abs(size - g) / g  # (14) with E7
+        share = 1.0 - (1.0 - gain * 0.991 / (1.0 + np.exp((2500.0 * e - 370.0) / 40.0))) ** (dt[k] * SAMPLE_HZ)  # (13)
+        sine = np.sqrt(up[0] ** 2 + up[1] ** 2)
+        # (15) on the global attitude (E9): about up x z, which has no vertical part
+        turn = share * np.arctan2(sine, up[2]) / max(sine, 1e-15) * np.array([up[1], -up[0], 0.0])
+        R = exp_rotation(turn) @ R
+        out[k] = R.T @ turn / dt[k]
+    return out
