@@ -181,7 +181,7 @@ def test_every_fault_has_its_line_in_the_order_of_the_file():
     text = "lag_s: x\nsensors:\n  imu: {topic: /imu}\n  prism: {topic: /p, loss: hubert}\n  odometer: {}\nlags: 3\n"
     assert fault(text).splitlines() == [
         'rig.yaml:1: lag_s: should be a valid number, got "x"',
-        "rig.yaml:4: sensors.prism.loss: should be 'none', 'huber' or 'cauchy', got \"hubert\"",
+        "rig.yaml:4: sensors.prism.loss: should be 'none', 'huber', 'cauchy' or 'gnc', got \"hubert\"",
         "rig.yaml:5: sensors.odometer.topic: is required",
         "rig.yaml:6: lags: unknown key; did you mean lag_s?",
     ]
