@@ -145,6 +145,26 @@ def _sbm(name: str, summary: str) -> Estimator:
     return Estimator(partial(sbm, name=name), summary, ("imu", "magnetometer"), "Wang et al. (2019)", model)
 
 
+def tbm_ins_ts(problem: Problem, progress: Progress) -> Result:
+    """The coupled filter of inertial unit and total station of Liu, Wang & Tao."""
+    from tbmfg.filters import tbm
+    from tbmfg.inertial.steps import to_ns
+    from tbmfg.outcome import result
+
+    name = "tbm-ins-ts"
+    options = switches(problem.rig, name, tbm.InsTs)
+    seen = tbm.view(problem, options)
+    f = tbm.run(seen, options, progress)
+    edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
+    return result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
+
+
+def _tbm_switches() -> type[Node]:
+    from tbmfg.filters.tbm import InsTs
+
+    return InsTs
+
+
 OWN: dict[str, Estimator] = {
     "batch": Estimator(
         batch,
@@ -183,6 +203,13 @@ OWN: dict[str, Estimator] = {
     ),
     "shearer-afkf": _shearer(
         "shearer-afkf", "shearer-ckf-ar as a federation of two local filters", "odometer", "magnetometer"
+    ),
+    "tbm-ins-ts": Estimator(
+        tbm_ins_ts,
+        "inertial navigation corrected by every prism fix of a total station, lever arm in the filter, gated",
+        ("imu", "prism"),
+        "Liu, Wang & Tao (TBM-MSE)",
+        _tbm_switches,
     ),
     "sbm-cf": _sbm("sbm-cf", "complementary filter: gyro with accelerometer and magnetometer, observers for the rest"),
     "sbm-ekf": _sbm("sbm-ekf", "extended Kalman filter in Euler angles, with laser spot and barometer"),

@@ -161,6 +161,9 @@ class Enhancement(Node):
         description="Modes that are thresholded; kept: as printed, which deletes motion; off: no decomposition.",
     )
     window_s: Positive = Field(4.0, description="Of the decomposition; windows overlap by half.")
+    give_back: Flag = Field(
+        True, description="What the modes take away of slow rates is given back; false: as printed."
+    )
     alpha_bar: Annotated[Number, Field(ge=0, le=1)] = Field(
         0.001, description="Gain of the tilt by gravity per sample of 475 Hz; 1: as printed; 0: off."
     )

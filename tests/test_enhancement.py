@@ -58,6 +58,19 @@ def test_an_oscillation_is_kept_by_its_peak_or_goes_as_a_whole():
     assert not found[210:].any()
 
 
+def test_the_modes_of_a_skewed_waveform_take_its_mean_and_it_is_given_back():
+    """A pump's harmonics: a slow rate of a ten-thousandth of them is lost many times over, and then is not."""
+    t = np.arange(int(12 * RATE)) / RATE
+    lines = sum(np.sin(2 * np.pi * 24.5 * k * t + k) / k for k in range(1, 10))
+    inside, weight = slice(WINDOW, -WINDOW), enhancement.hann(len(t) - 2 * WINDOW)
+    lost, kept = (
+        weight @ enhancement.enhanced((1e-4 + lines)[:, None], "noise", WINDOW, give_back)[inside, 0] / weight.sum()
+        for give_back in (False, True)
+    )
+    assert abs(lost - 1e-4) > 1e-3
+    assert abs(kept - 1e-4) < 1e-4
+
+
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 400), st.sampled_from(["noise", "kept"]), st.sampled_from([0.0, 1.0, 1e9]))
 def test_any_length_gives_as_many_finite_values(count, rule, size):

@@ -60,8 +60,20 @@ def gyrocompass(
 ) -> float:
     """Turn about the vertical [rad] from the levelled start frame to n: still, it feels Earth's rate only."""
     rows = rows_between(steps, *max(still, key=lambda s: s[1] - s[0]))
-    felt = R_level @ R_0t[rows.start] @ steps.gyro[rows].mean(axis=0)
+    felt = R_level @ R_0t[rows.start] @ mean_rate(steps, rows)
     return float(np.arctan2(earth_n[1], earth_n[0]) - np.arctan2(felt[1], felt[0]))
+
+
+def mean_rate(steps: Steps, rows: slice) -> Floats:
+    """Mean rate of a shaking body that stays where it is, (3,) rad/s.
+
+    It is the rotation vector phi that comes back, and its rate is w + phi x w / 2: the mean of w alone errs by the
+    coning, which for 0.5 deg/s at 24.5 Hz about two axes is a tenth of a degree of heading. First order in phi.
+    """
+    rate, dt = steps.gyro[rows], steps.dt[rows][:, None]
+    shaking = rate - rate.mean(axis=0)
+    phi = np.cumsum(shaking * dt, axis=0)
+    return rate.mean(axis=0) + 0.5 * np.cross(phi - phi.mean(axis=0), shaking).mean(axis=0)
 
 
 def gyrocompass_bound(gyro_bias_sd: float, earth_n: Floats) -> float:

@@ -3,8 +3,10 @@
 Liu, Wang & Tao (TBM-MSE), section 2, corrected; (n) are its equations, E its errata. Its z axes point down; here they
 point up, so what it calls the predicted down, -C f / |f|, is up with the other sign.
 
-Smoothed samples are no longer the truth plus white noise: what was taken away may have been motion. Of that the filters
-are told as noise, see :func:`changed_density`.
+A mode's middle is that of its envelopes, which for a waveform that is steeper on one side is not its mean: the modes of
+a pump take some of the slow rate with them, many times the Earth's. So what was taken away is averaged over a window
+and given back: beyond the paper, ``give_back``. And smoothed samples are no longer the truth plus white noise: what
+was taken away may have been motion. Of that the filters are told as noise, see :func:`changed_density`.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
+from scipy.signal import fftconvolve
 
 from tbmfg.inertial.steps import Steps
 from tbmfg.inertial.strapdown import exp_rotation
@@ -35,20 +38,23 @@ class Changed:
     density: tuple[float, float]
 
 
-def denoise(steps: Steps, rule: Rule, window_s: float) -> tuple[Steps, Changed]:
-    """Steps with every axis through :func:`smooth`; their extra noise is that of :func:`changed_density`."""
+def denoise(steps: Steps, rule: Rule, window_s: float, give_back: bool = True) -> tuple[Steps, Changed]:
+    """Steps with gyro and accelerometer :func:`enhanced`; their extra noise is that of :func:`changed_density`."""
     size = 2 * max(SHORTEST, round(0.5 * window_s / steps.period_s))
-    smoothed = [
-        np.stack([smooth(values[:, axis], rule, size) for axis in range(3)], axis=1)
-        for values in (steps.gyro, steps.acc)
-    ]
-    parts = [new - old for new, old in zip(smoothed, (steps.gyro, steps.acc), strict=True)]
-    density = [changed_density(part, steps.period_s, size) for part in parts]
+    gyro, acc = (enhanced(values, rule, size, give_back) for values in (steps.gyro, steps.acc))
+    parts = gyro - steps.gyro, acc - steps.acc
+    density = tuple(changed_density(part, steps.period_s, size) for part in parts)
     found = replace(
-        steps, gyro=smoothed[0], acc=smoothed[1],
+        steps, gyro=gyro, acc=acc,
         extra_gyro=steps.extra_gyro + density[0] ** 2, extra_acc=steps.extra_acc + density[1] ** 2,
     )  # fmt: skip
-    return found, Changed(tuple(float(np.sqrt(np.mean(part**2))) for part in parts), tuple(density))
+    return found, Changed(tuple(float(np.sqrt(np.mean(part**2))) for part in parts), density)
+
+
+def enhanced(x: Floats, rule: Rule, size: int, give_back: bool) -> Floats:
+    """x (n, k) through :func:`smooth`, column by column, and the running mean of what that took away."""
+    out = np.stack([smooth(column, rule, size) for column in x.T], axis=1)
+    return out + running_mean(x - out, size) if give_back else out
 
 
 def smooth(x: Floats, rule: Rule, size: int) -> Floats:
@@ -57,7 +63,7 @@ def smooth(x: Floats, rule: Rule, size: int) -> Floats:
     A value is final when the last window that holds it is full: the step is not causal, it lags by up to a window.
     """
     half = size // 2
-    fade = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    fade = hann(size)
     total, weight = np.zeros(len(x)), np.zeros(len(x))
     for first in range(-half, len(x), half):
         begin, end = max(first, 0), min(first + size, len(x))
@@ -67,6 +73,17 @@ def smooth(x: Floats, rule: Rule, size: int) -> Floats:
         total[begin:end] += share * threshold(x[begin:end], rule)
         weight[begin:end] += share
     return np.where(weight > 0, total / np.where(weight > 0, weight, 1.0), x)
+
+
+def running_mean(x: Floats, size: int) -> Floats:
+    """Mean of x (n, k) about each sample under a Hann window of ``size`` samples, shorter at the ends."""
+    window = hann(size)[:, None]
+    return fftconvolve(x, window, "same", axes=0) / fftconvolve(np.ones((len(x), 1)), window, "same", axes=0)
+
+
+def hann(size: int) -> Floats:
+    """The window, (size,): halves that overlap add to one."""
+    return np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
 
 
 def threshold(x: Floats, rule: Rule) -> Floats:
@@ -102,7 +119,7 @@ def changed_density(change: Floats, period_s: float, size: int) -> float:
     variance for a white noise of density S.
     """
     size = min(size, len(change))
-    window = np.sin(np.pi * (np.arange(size) + 0.5) / size) ** 2
+    window = hann(size)
     firsts = range(0, len(change) - size + 1, max(1, size // 2))
     means = np.array([window @ change[first : first + size] for first in firsts]) / window.sum()
     return float(np.sqrt(np.mean(means**2) * window.sum() ** 2 * period_s / np.sum(window**2)))

@@ -20,7 +20,7 @@ def denoised(rig: Rig, steps: Steps, warnings: list[str]) -> Steps:
     wanted = rig.imu.enhancement
     if wanted is None or wanted.emd_threshold == "off":
         return steps
-    found, changed = enhancement.denoise(steps, wanted.emd_threshold, wanted.window)
+    found, changed = enhancement.denoise(steps, wanted.emd_threshold, wanted.window, wanted.give_back)
     (gyro, acc), (gyro_density, acc_density) = changed.rms, changed.density
     warnings.append(
         f"imu: enhanced by mode decomposition in windows of {wanted.window:g} s, so that an online estimate lags by as "

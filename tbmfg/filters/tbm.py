@@ -1,0 +1,155 @@
+"""The INS / total station filter of a roadheader, by Liu, Wang & Tao (TBM-MSE), section 3.
+
+Numbers in brackets are the paper's equations, E its errata; the corrected form is meant throughout. The paper's error
+is computed minus true with C_computed = exp(-[phi]x) C_true, z down; here it is that of ``inertial.strapdown``, true =
+estimate (+) error with a rotation d in b, z up: phi = R d, all else changes sign. So (9)-(12) are ``mechanise_step``
+on increments with (8) and the coning and sculling of (11), (19)-(21) with E11-E13 are ``propagate``, (22) with E14 and
+E15 is ``sensors.prism``, (25) is ``kalman.correct`` and (26) with E17 ``correct_state``.
+
+Every fix is taken when it comes, at the IMU edge nearest to it and carried from there by the velocity. Nothing else is
+used: no zero velocity, no other sensor. A prior of the heading is needed, for a slow machine's prism hardly tells it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import chi2
+
+from tbmfg.fields import Node, Positive
+from tbmfg.filters.kalman import correct, innovation, predict
+from tbmfg.inertial.strapdown import BA_, BG_, correct_state, propagate
+from tbmfg.measure import gyro_frame, position_rows
+from tbmfg.problem import GATE, Parameters, Problem
+from tbmfg.rig import Imu, kind_of
+from tbmfg.sensors import Rows
+from tbmfg.state import BA, BG, NAV
+from tbmfg.timeseries import Floats
+
+LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
+
+
+class InsTs(Node):
+    """Switches of ``tbm-ins-ts``."""
+
+    arm: Literal["estimated", "fixed", "none"] = Field(
+        "estimated",
+        description="The lever arm: a state where the rig gives it a sd; known, as in the paper; left out, to see what "
+        "it is worth.",
+    )
+    tau_s: Positive | None = Field(
+        None, description="Correlation time of the biases (18), sds as in the rig; null: the rig's random walks."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Filtered:
+    """States (n, 21) and covariances (n, 15, 15) at the keyframes, calibrations (m,) with covariance (m, m) at the end,
+    NIS and gate flags by sensor and row."""
+
+    x: Floats
+    cov: Floats
+    c: Floats
+    c_cov: Floats
+    nis: dict[str, Floats]
+    gated: dict[str, np.ndarray]
+
+
+def view(problem: Problem, switches: InsTs) -> Problem:
+    """The problem as the filter sees it: the prism's fixes one by one, as rows at IMU edges."""
+    samples = {name: s for name, s in problem.samples.items() if kind_of(name) == "prism"}
+    known, inertial, rig = problem.parameters, problem.inertial, problem.rig
+    own = [k for k, name in enumerate(known.names) if name.rpartition(".")[0] in samples]
+    names, mean, start, sd = tuple(known.names[k] for k in own), known.mean[own], known.start[own], known.sd[own]
+    arms = np.array([".arm_" in name for name in names])
+    if switches.arm == "none":
+        mean, start = np.where(arms, 0.0, mean), np.where(arms, 0.0, start)
+    sd = np.where(arms & (switches.arm == "estimated"), sd, 0.0)  # clock offsets are those that prepare has found
+    parameters = Parameters(names, mean, sd, start)
+    frame = gyro_frame(inertial.steps, inertial.gyro, problem.prior.x[BG_])
+    rows = [
+        position_rows(
+            rig.sensors[name], s, problem.clock_offset_s[name], inertial.steps.edges_s, frame, problem.origin_n,
+            parameters.slice(name),
+        )
+        for name, s in samples.items()
+    ]  # fmt: skip
+    return replace(problem, rows=rows, samples=samples, parameters=parameters, drift_names=(), drift_walk=np.zeros(0))
+
+
+def run(problem: Problem, switches: InsTs, progress: Callable[[float], None] | None = None) -> Filtered:
+    """Filter a problem as :func:`view` gives it."""
+    parameters, free, keyframes = problem.parameters, problem.parameters.free, problem.keyframe_edges
+    x, c = problem.prior.x[:21].copy(), parameters.start.copy()
+    P = np.diag(np.concatenate([np.zeros(NAV), parameters.sd[free] ** 2]))
+    P[:NAV, :NAV] = problem.prior.filter_cov[:NAV, :NAV]
+    predicted = Prediction(problem, switches.tau_s)
+    nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
+    gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
+    epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows]))
+    due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
+    for rows in problem.rows:
+        for r, number in enumerate(np.searchsorted(epochs, rows.i)):
+            due[number].append((rows, r))
+
+    xs, covs, last = [], [], keyframes[0]
+    for number, epoch in enumerate(epochs):
+        x, P = predicted(x, P, last, epoch)
+        last = epoch
+        for rows, r in due[number]:
+            residual, H = linearise(rows, r, x, c, free)
+            nis[rows.sensor][r] = innovation(P, H, residual)[0]
+            gated[rows.sensor][r] = nis[rows.sensor][r] > chi2.ppf(GATE, rows.dof)
+            if not gated[rows.sensor][r]:
+                dx, P = correct(P, H, residual)  # (23)-(25)
+                x = correct_state(x, dx[:NAV])  # (26)
+                c[free] += dx[NAV:]
+        if epoch == keyframes[len(xs)]:
+            xs.append(x)
+            covs.append(P[:NAV, :NAV])
+        if progress is not None and number % 1000 == 0:
+            progress(number / len(epochs))
+    c_cov = np.zeros((len(c), len(c)))
+    c_cov[np.ix_(free, free)] = P[NAV:, NAV:]
+    return Filtered(np.array(xs), np.array(covs), c, c_cov, nis, gated)
+
+
+class Prediction:
+    """(9)-(12), (19)-(21) over the steps of a problem. With ``tau_s`` the biases are Gauss-Markov, (18) with E11."""
+
+    def __init__(self, problem: Problem, tau_s: float | None) -> None:
+        self.inertial, self.tau_s = problem.inertial, tau_s
+        imu: Imu = problem.rig.imu
+        self.walks = problem.inertial.psd_bg, problem.inertial.psd_ba
+        if tau_s is not None:  # so that the variance stays that of the rig's sds
+            self.walks = 2.0 * imu.gyro_bias_sd**2 / tau_s, 2.0 * imu.acc_bias_sd**2 / tau_s
+
+    def __call__(self, x: Floats, P: Floats, first: int, last: int) -> tuple[Floats, Floats]:
+        """State and covariance at the edge ``last``, from those at ``first``."""
+        inertial, edges_s = self.inertial, self.inertial.steps.edges_s
+        noise = inertial.psd_gyro, inertial.psd_acc, *self.walks, inertial.earth_n, inertial.gravity_n
+        pieces = max(1, int(np.ceil((edges_s[last] - edges_s[first]) / LONGEST_S - 1e-9)))
+        for begin, end in pairwise(np.linspace(first, last, pieces + 1).astype(int)):
+            x, Phi, Q = propagate(x, begin, end, edges_s, inertial.gyro, inertial.acc, *noise)
+            if self.tau_s is not None:
+                left = np.exp(-(edges_s[end] - edges_s[begin]) / self.tau_s)
+                x[BA_], x[BG_] = left * x[BA_], left * x[BG_]
+                for rows in (BA, BG):
+                    Phi[rows], Q[rows] = left * Phi[rows], left * Q[rows]
+                    Q[:, rows] *= left
+            P = predict(P, Phi, Q)
+        return x, P
+
+
+def linearise(rows: Rows, r: int, x: Floats, c: Floats, free: np.ndarray) -> tuple[Floats, Floats]:
+    """Whitened residual of one row and its Jacobian to [state, free calibrations]."""
+    one = x[None]
+    residual, Ji, _, Jc = (part[0] for part in rows.evaluate_at(one, one, c, slice(r, r + 1)))
+    calibrations = np.zeros((len(residual), len(c)))
+    calibrations[:, rows.calib] = Jc
+    return residual, np.hstack([Ji, calibrations[:, free]])
