@@ -15,6 +15,7 @@ from tbmfg.rig import Barometer, Keyframes, Laser, Magnetometer, Odometer, Posit
 from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
 
+HELD_S = 0.05  # a speed may stand for this much time at least
 SMOOTHED_S = 4.0  # the speed that an odometer's scale is judged on is a mean over this time
 RATE_WINDOW_S = 0.02  # the angular rate at a fix is a mean over this much on either side
 
@@ -165,8 +166,8 @@ def periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
     spacing = np.diff(speeds.t_s)
     period = float(np.median(spacing))
     ends = speeds.t_s - sensor.clock_offset
-    # stamps jitter: a sample covers the time since the one before, unless one was lost between them
-    alone = np.append(True, spacing > GAP * period)
+    # stamps jitter, in bursts on a bus: a sample covers the time since the one before, unless some were lost between
+    alone = np.append(True, spacing > max(GAP * period, HELD_S))
     return ends - np.where(alone, period, np.append(period, spacing)), ends, period
 
 

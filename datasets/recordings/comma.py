@@ -13,14 +13,20 @@ from scipy.spatial.transform import Rotation
 
 from datasets.recordings import Arrays, Recording, fixes, imu, magnetic, read_npz, rig_of, stamps
 from tbmfg import earth
+from tbmfg.errors import TbmfgError
 from tbmfg.timeseries import Floats, Series
 
 SD_ENU = (3.0, 3.0, 6.0)  # m: the fixes do not say; a single-frequency receiver in the open
 FRD_FROM_FLU = np.diag([1.0, -1.0, -1.0])
 
 
-def load(source: str | Path) -> Recording:
-    """The minute; n touches the Earth at the first fix."""
+GYRO = {"raw": "imu_gyro_uncalibrated", "device": "imu_gyro"}  # ``device``: less its own running estimate of the bias
+
+
+def load(source: str | Path, *, gyro: str = "raw") -> Recording:
+    """The minute; n touches the Earth at the first fix. ``gyro`` raw, or as the device's own calibration leaves it."""
+    if gyro not in GYRO:
+        raise TbmfgError(f"comma: gyro={gyro}; there are {', '.join(GYRO)}")
     arrays = read_npz(source)
     rig = rig_of("comma")
     speed = arrays["can_wheel_speed"].mean(axis=1)
@@ -30,11 +36,10 @@ def load(source: str | Path) -> Recording:
     fix_ns = stamps(arrays["gnss_live_gnss_ublox_t"])
     llh_deg = np.column_stack([latitude, longitude, height])
     origin_llh = llh_deg[0] * [np.pi / 180, np.pi / 180, 1.0]
-    # raw rates: the calibrated ones have the device's running estimate of the bias taken off
-    gyro, acc = arrays["imu_gyro_uncalibrated"], arrays["imu_accelerometer"]
+    rates, acc = arrays[GYRO[gyro]], arrays["imu_accelerometer"]
     topics = {name: sensor.topic for name, sensor in rig.sensors.items()}
     series = (
-        imu(topics["imu"], stamps(arrays["imu_accelerometer_t"]), gyro, acc),
+        imu(topics["imu"], stamps(arrays["imu_accelerometer_t"]), rates, acc),
         Series(topics["odometer"], "geometry_msgs/msg/TwistStamped", speed_ns, speeds, "base_link"),
         fixes(topics["gnss"], fix_ns, llh_deg, np.tile(SD_ENU, (len(fix_ns), 1))),
         magnetic("/magnetometer", stamps(arrays["imu_magnetometer_t"]), arrays["imu_magnetometer"]),
