@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from tbmfg.timeseries import Floats, Log, StreamCounts
 
 if TYPE_CHECKING:
     from datasets.simulate import Simulation
+    from tbmfg.bounds import Bounds
     from tbmfg.problem import Problem
     from tbmfg.state import Result, Truth
 
@@ -62,11 +63,13 @@ class Measured:
     normalised: Floats
     z: dict[str, float]
     failure: str = ""
+    over: dict[str, float] = field(default_factory=dict)
 
 
 def run(job: Job) -> list[Measured]:
     """Simulate, prepare once, estimate with each, measure."""
     import datasets
+    from tbmfg.bounds import cramer_rao
     from tbmfg.estimators import estimate
     from tbmfg.prepare import prepare
 
@@ -74,11 +77,12 @@ def run(job: Job) -> list[Measured]:
         job.dataset, seed=job.seed, duration=job.duration_s, settings=job.settings, **job.options
     )
     measured = []
-    problem = None
+    problem = bounds = None
     for name in job.estimators:
         try:
             problem = problem or prepare(in_memory(simulation), simulation.rig, without=job.without)
-            measured.append(measure(job, simulation, problem, estimate(name, problem)))
+            bounds = bounds or cramer_rao(problem, true_states(simulation, problem.t_ns))
+            measured.append(measure(job, simulation, problem, bounds, estimate(name, problem)))
         except TbmfgError as error:
             none = np.zeros(0)
             measured.append(Measured(job.scenario, name, job.seed, {}, {}, none, none, {}, none, {}, str(error)))
@@ -91,9 +95,10 @@ def in_memory(simulation: Simulation) -> Log:
     return Log(simulation.name, series, {clouds.topic: clouds for clouds in simulation.clouds})
 
 
-def measure(job: Job, simulation: Simulation, problem: Problem, result: Result) -> Measured:
+def measure(job: Job, simulation: Simulation, problem: Problem, bounds: Bounds, result: Result) -> Measured:
     """Errors of ``result`` against the simulation's truth at the keyframes themselves, not interpolated."""
-    from tbmfg.evaluation.metrics import evaluate, nees, trajectory_errors
+    from tbmfg.estimators import ESTIMATORS
+    from tbmfg.evaluation.metrics import evaluate, expected, nees, trajectory_errors
 
     path = result.trajectory
     truth = true_states(simulation, path.t_ns)
@@ -113,6 +118,8 @@ def measure(job: Job, simulation: Simulation, problem: Problem, result: Result) 
         metrics[f"nis_{name}", "per dof"] = float(np.mean(accepted)) / innovations.dof
         metrics[f"gated_{name}", "%"] = 100.0 * float(np.mean(innovations.gated))
 
+    bound = bounds.smoothing if ESTIMATORS[result.estimator].whole else bounds.filtering
+    least = expected(bound, true_states(simulation, bound.t_ns))
     errors = trajectory_errors(path, truth)
     at = epochs(path.t_ns - simulation.start_ns, job.duration_s, job.epochs)
     bias_acc, bias_gyro = true_biases(simulation, path.t_ns)
@@ -136,6 +143,7 @@ def measure(job: Job, simulation: Simulation, problem: Problem, result: Result) 
         z=calibration_z(simulation, result) | {
             f"bias_gyro_{axis}": float(stacked[-1, 12 + k] / sd[-1, 12 + k]) for k, axis in enumerate("xyz")
         },
+        over={name: found[key] / least[key] for key, (name, *_) in ERRORS.items() if least.get(key)},
     )  # fmt: skip
 
 
@@ -187,13 +195,14 @@ def calibration_z(simulation: Simulation, result: Result) -> dict[str, float]:
     named = {"arm_m": "lever_arm_m", "clock_offset_s": "clock_offset_s", "scale": "scale"}
     z = {}
     for sensor, drawn in simulation.drawn.items():
-        for field, name in named.items():
+        for drawn_name, name in named.items():
             found = result.calibration.get(f"{sensor}_{name}")
-            if field not in drawn or found is None or not found.estimated:
+            if drawn_name not in drawn or found is None or not found.estimated:
                 continue
-            scores = np.atleast_1d((np.array(found.value) - drawn[field]) / np.array(found.sd))
+            scores = np.atleast_1d((np.array(found.value) - drawn[drawn_name]) / np.array(found.sd))
             labels = [f"_{axis}" for axis in "xyz"] if len(scores) == 3 else [""]
             z |= {
-                f"{sensor}_{field.removesuffix('_m')}{label}": float(s) for label, s in zip(labels, scores, strict=True)
+                f"{sensor}_{drawn_name.removesuffix('_m')}{label}": float(s)
+                for label, s in zip(labels, scores, strict=True)
             }
     return z

@@ -78,6 +78,25 @@ def test_false_alarms_of_a_whole_command_are_one_percent():
     assert alarms == pytest.approx(0.01, abs=4 * np.sqrt(0.01 / commands))
 
 
+def test_errors_over_their_bound_are_pooled_with_their_doubt():
+    """Of errors drawn with the bound's own covariance, three components a run, the pooled ratio is 1, and the lower
+    limit of 95 % lies above it in 5 % of the studies."""
+    rng = np.random.default_rng(6)
+    studies = [np.sqrt(rng.chisquare(3, 50) / 3) for _ in range(2000)]
+    found = [accuracy.over_bound("s", "batch", "position", list(ratios), 1.05) for ratios in studies]
+    assert np.mean([mean.mean for mean, _ in found]) == pytest.approx(1.0, abs=0.01)
+    spread = np.std([mean.mean for mean, _ in found])
+    assert np.mean([mean.sd for mean, _ in found]) / np.sqrt(50) == pytest.approx(spread, rel=0.1)
+    assert np.mean([low.mean > 1.0 for _, low in found]) == pytest.approx(0.05, abs=0.03)
+    mean, low = found[0]
+    assert mean.bound == (None, pytest.approx(1.05 + 2 * mean.sd / np.sqrt(50)))
+    assert low.bound == (None, 1.05)
+    [worse, lowest] = accuracy.over_bound("s", "batch", "position", list(1.5 * studies[0]), 1.05)
+    assert not worse.inside
+    assert not lowest.inside
+    assert [row.bound for row in accuracy.over_bound("s", "isam2", "position", [1.0, 1.1], None)] == [None]
+
+
 def test_epochs_end_with_the_log_and_are_the_nearest_keyframes():
     stamps = np.array([0, 9, 11, 19, 22, 30]) * 10**9
     assert runs.epochs(stamps, 30.0, 3).tolist() == [1, 3, 5]
@@ -167,6 +186,7 @@ def test_accuracy_runs_and_becomes_a_baseline_that_it_then_holds(capsys, monkeyp
     assert {row.estimator for row in rows} == {"batch", "ins"}
     metrics = {row.metric for row in rows}
     assert {"position", "ape", "prism_point", "yaw", "tilt", "velocity", "nees_pose@3s", "nees_pose@6s"} <= metrics
+    assert {"position_over_bound", "attitude_over_bound", "tilt_over_bound", "velocity_over_bound"} <= metrics
     assert {"within_1sd", "z_prism_arm_x", "z_odometer_scale", "z_bias_gyro_z", "nis_prism"} <= metrics
     assert all(row.n == 2 and row.mean is not None for row in rows)
     assert json.loads(baseline.read_text())["accuracy"]["options"]["seeds"] == 2
