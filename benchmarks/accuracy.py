@@ -134,10 +134,10 @@ def summarise(measured: list[Measured], alpha: float) -> list[Row]:
     if not good:
         return rows
     first = good[0]
-    for name, unit in first.metrics:
+    for name, unit in dict.fromkeys(key for one in good for key in one.metrics):  # a sensor may be silent in some logs
         limits = [one.limits[name] for one in good if name in one.limits]
         bound = (None, float(np.mean(limits))) if limits else None
-        rows.append(row(name, unit, (one.metrics[name, unit] for one in good), bound))
+        rows.append(row(name, unit, (one.metrics[name, unit] for one in good if (name, unit) in one.metrics), bound))
     for name in first.over:
         judged = scenario in NOMINAL and name in JUDGED
         ratios = [one.over[name] for one in good]
@@ -152,8 +152,8 @@ def summarise(measured: list[Measured], alpha: float) -> list[Row]:
     for k in (1, 2, 3):
         within = (100.0 * np.mean(np.abs(one.normalised) < k) for one in good)
         rows.append(row(f"within_{k}sd", "%", within))
-    for name in first.z:
-        rows.append(row(f"z_{name}", "sd", (one.z[name] for one in good)))
+    for name in dict.fromkeys(key for one in good for key in one.z):
+        rows.append(row(f"z_{name}", "sd", (one.z[name] for one in good if name in one.z)))
     return rows
 
 

@@ -12,6 +12,7 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``shearer``   another; ``shearer_magfault``: the same beside steel; ``shearer_panel``: along the face and back
 - ``shaft``     a shaft boring machine, standing, cutting, turning, sinking; ``cage``: its unit on a cage in the shaft
 - ``worlds``, ``lidar``  places underground, and how a LiDAR sees them: ``tbm_tunnel``, ``tbm_roadway``
+- ``faults``    what goes wrong, done to a log on purpose: ``python -m datasets corrupt LOG -o FILE --fault KIND``
 - ``recordings``  what was really measured, from the npz it is packaged in
 """
 

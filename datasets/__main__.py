@@ -1,4 +1,4 @@
-"""``python -m datasets``: list the datasets, make one, import one."""
+"""``python -m datasets``: list the datasets, make one, import one, corrupt a log."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from datasets import MACHINES, RECORDINGS, defaults, load, make, own_duration, summary
+from datasets import MACHINES, RECORDINGS, defaults, faults, load, make, own_duration, summary
 from tbmfg.errors import TbmfgError
 
 
@@ -34,8 +34,24 @@ def main(arguments: list[str] | None = None) -> int:
             dest="assignments",
             help="an option of the dataset, or with dots a value of its rig: sensors.prism.sigma_mm=2",
         )
+    corrupter = commands.add_parser("corrupt", help="copy a log with faults, told in its attachment faults.json")
+    corrupter.add_argument("source", type=Path, metavar="LOG", help="an .mcap file or a rosbag2 folder")
+    corrupter.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the .mcap to write")
+    corrupter.add_argument("--seed", type=int, default=0, help="of every draw (default 0)")
+    corrupter.add_argument(
+        "--fault",
+        action="append",
+        required=True,
+        metavar="KIND[:KEY=VALUE,..]",
+        help=f"repeatable; {', '.join(faults.KINDS)}; keys topic, start, end, and of the kind: gross:share=0.3,size=2",
+    )
     given = parser.parse_args(arguments)
     try:
+        if given.command == "corrupt":
+            for told in faults.corrupt(given.source, given.output, [*map(faults.parse, given.fault)], seed=given.seed):
+                print("{topic}: {kind}, {start_s:.1f}-{end_s:.1f} s".format(**told), end="")
+                print(f", {len(told['stamps_ns'])} of {told['messages']} messages")
+            return 0
         if given.command == "list":
             print("\n".join(describe(name) for name in (*MACHINES, *RECORDINGS)))
             return 0

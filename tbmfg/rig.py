@@ -239,6 +239,8 @@ class Prism(PositionSensor):
     sigma_mm: Positive = Field(3.0, description="Constant part per axis.")
     sigma_ppm: NotNegative = Field(1.5, description="Part that grows with range, mm per km.")
     station_m: Triple = Field(ZERO, description="Where the total station stands in n, for the range.")
+    # fixes on another reflector are metres off and come in runs: what pulls with all its weight must not pull at all
+    loss: Loss = Field("cauchy", description="Weight of outliers in the graph.")
 
     station = si("station_m")
 

@@ -252,10 +252,14 @@ def test_a_frozen_imu(write, topic, column, what):
     assert "it is stuck; check the sensor and its driver" in message
 
 
-def test_an_imu_that_hangs_for_a_while_is_said(write, topic):
+def test_repeats_of_an_imu_that_hangs_are_left_out_and_bridged(write, topic):
     stuck = {name: set_rows(topic[IMU][name], slice(9000, 10_000), topic[IMU][name][9000]) for name in ("gyro", "acc")}
-    warning = only_warning(run(write({IMU: changed(topic[IMU], **stuck)})), "imu: hangs on one reading")
-    assert "stretches: 1, the longest 2.10 s at 18.95 s" in warning
+    summary = run(write({IMU: changed(topic[IMU], **stuck)}))
+    warning = only_warning(summary, "imu: hangs on one reading")
+    assert "stretches: 1, the longest 2.10 s at 18.95 s; its 999 repeats are left out" in warning
+    assert "imu: gaps: 1, 2.1 s together" in only_warning(summary, "imu: gaps")
+    assert summary["sensors"]["imu"]["used"] == len(topic[IMU]) - 999
+    assert summary["metrics"]["attitude_rms_deg"] < 0.5
 
 
 def test_impossible_readings_are_left_out(write, topic):

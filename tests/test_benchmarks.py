@@ -102,6 +102,13 @@ def test_epochs_end_with_the_log_and_are_the_nearest_keyframes():
     assert runs.epochs(stamps, 30.0, 3).tolist() == [1, 3, 5]
 
 
+def test_a_metric_that_some_runs_lack_is_of_the_others():
+    good = drawn(np.random.default_rng(4), 3)
+    good[1].metrics["nis_zero_velocity", "per dof"] = 0.9
+    row = by_metric(accuracy.summarise(good, 0.01))["nis_zero_velocity"]
+    assert (row.mean, row.n) == (0.9, 1)
+
+
 def test_failed_seeds_are_counted_and_left_out():
     good = drawn(np.random.default_rng(4), 3)
     rows = by_metric(accuracy.summarise([*good, replace(good[0], seed=9, failure="no prism")], 0.01))

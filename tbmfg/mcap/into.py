@@ -6,6 +6,7 @@ import heapq
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -40,35 +41,44 @@ def write_into(
     ``stamped_topic`` are. Raises LogError where a file is damaged (nothing is left out of a copy), where the topics
     exist already, and where the target cannot be written.
     """
+    with copying(source, target) as copy:
+        types, streams = trajectory_messages(trajectory, delay_ns=_delay_ns(copy.files, stamped_topic))
+        ours = heapq.merge(*streams, key=lambda message: message[0])
+        added = ((log_ns, OURS, (topic, payload)) for log_ns, topic, payload in ours)
+        for log_ns, number, what in heapq.merge(records(copy.files), added, key=lambda one: one[0]):
+            if number == OURS:
+                copy.add(types[what[0]], log_ns, *what)
+            elif what[1].topic in types:
+                raise LogError(f"{source}: holds {what[1].topic} already; give the recording without it")
+            else:
+                copy.keep(number, *what)
+
+
+@contextmanager
+def copying(source: str | os.PathLike, target: str | os.PathLike) -> Iterator[Copy]:
+    """A copy of the recording ``source``, to be given its messages; its attachments and metadata come last, and the
+    file ``target`` appears when it is complete. Errors as in :func:`write_into`."""
     files, target = recording_files(source), Path(target)
     if target.suffix != ".mcap":
         raise LogError(f"{target}: the copy is one file; give it a name that ends in .mcap")
     if any(target.exists() and target.samefile(file) for file in files):
         raise LogError(f"{target}: is the recording itself; give the copy another name")
     try:
-        types, streams = trajectory_messages(trajectory, delay_ns=_delay_ns(files, stamped_topic))
-        ours = heapq.merge(*streams, key=lambda message: message[0])
-        added = ((log_ns, OURS, (topic, payload)) for log_ns, topic, payload in ours)
         with replacing(target) as temporary, open(temporary, "wb") as file:
-            copy = _Copy(file)
-            for log_ns, number, what in heapq.merge(_records(files), added, key=lambda one: one[0]):
-                if number == OURS:
-                    copy.add(types[what[0]], log_ns, *what)
-                elif what[1].topic in types:
-                    raise LogError(f"{source}: holds {what[1].topic} already; give the recording without it")
-                else:
-                    copy.keep(number, *what)
-            copy.close(files)
+            copy = Copy(file, files)
+            yield copy
+            copy.close()
     except OSError as error:
         raise LogError(f"{target}: cannot be written ({error.strerror}); check the folder and its free space") from None
     except (McapError, zstandard.ZstdError, RuntimeError, struct.error, ValueError) as error:
         raise LogError(f"{source}: damaged ({error}); a copy would not be whole, so none is made") from error
 
 
-class _Copy:
-    """The new file: channels of the sources as they were, one per file and id, and ours."""
+class Copy:
+    """The new file of the recording ``files``: channels of the sources as they were, one per file and id, and ours."""
 
-    def __init__(self, file: Any) -> None:
+    def __init__(self, file: Any, files: list[Path]) -> None:
+        self.files = files
         self.writer = Writer(file, compression=CompressionType.ZSTD)
         self.writer.start(profile="ros2", library="tbmfg")
         self._channels: dict[tuple[int, int], int] = {}
@@ -100,9 +110,13 @@ class _Copy:
             self._schemas[name, encoding, data] = self.writer.register_schema(name, encoding, data)
         return self._schemas[name, encoding, data]
 
-    def close(self, files: list[Path]) -> None:
+    def attach(self, name: str, data: bytes) -> None:
+        """An attachment of ours."""
+        self.writer.add_attachment(0, 0, name, "application/octet-stream", data)
+
+    def close(self) -> None:
         """Attachments and metadata, then the index."""
-        for path in files:
+        for path in self.files:
             with open(path, "rb") as file:
                 reader = make_reader(file)
                 for one in reader.iter_attachments():
@@ -112,7 +126,7 @@ class _Copy:
         self.writer.finish()
 
 
-def _records(files: list[Path]) -> Iterator[tuple[int, int, tuple[Schema | None, Channel, Record]]]:
+def records(files: list[Path]) -> Iterator[tuple[int, int, tuple[Schema | None, Channel, Record]]]:
     """Every message of the recording by log time: (log time, number of its file, what was read)."""
 
     def of(number: int, path: Path) -> Iterator[tuple[int, int, tuple[Schema | None, Channel, Record]]]:

@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +133,21 @@ def decode(layout: Layout, data: NDArray[np.uint8], sizes: Times) -> Rows:
     if not good.all():
         t_ns, columns = t_ns[good], {name: values[good] for name, values in columns.items()}
     return Rows(good, t_ns, columns, strings)
+
+
+def patched(layout: Layout, payload: bytes, values: Mapping[str, Any], t_ns: int | None = None) -> bytes:
+    """One CDR message with these members, and its stamp, replaced; every other byte stays. Raises ValueError for one
+    that does not fit the layout."""
+    dtype, _, _ = _place(layout, bytes(payload))
+    if dtype is None:
+        raise ValueError(f"a message of {len(payload)} bytes does not fit its layout")
+    data = bytearray(payload)
+    message = np.frombuffer(data, dtype=dtype)
+    for name, value in values.items():
+        message[name] = value
+    if t_ns is not None:
+        message["_sec"], message["_nsec"] = divmod(int(t_ns), NS)
+    return bytes(data)
 
 
 def _place(layout: Layout, payload: bytes) -> tuple[np.dtype | None, list[int], dict[str, str]]:

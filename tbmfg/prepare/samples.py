@@ -65,6 +65,20 @@ def imu_steps(
         lost = {"hold NaN": c.nonfinite, "repeat a stamp": c.duplicate, "bear a wrong stamp": c.misdated}
         why = ", ".join(f"{count} {what}" for what, count in lost.items() if count) or "there are no more"
         raise LogError(f"{log.path}: {topic}: {len(series)} usable of {c.received} IMU samples ({why}); check the IMU")
+    if (fault := sanity.fault(make_steps(series, rig.imu.T_bi.R, rig.imu.stamp))) is not None:
+        raise LogError(f"{log.path}: {topic}: {fault}")
+    if stretches := sanity.stuck(series):
+        t = seconds(series.t_ns, int(series.t_ns[0]))
+        first, last = max(stretches, key=lambda s: t[s[1]] - t[s[0]])
+        repeats = np.concatenate([np.arange(a + 1, b + 1) for a, b in stretches])
+        series = series.select(np.setdiff1d(np.arange(len(series)), repeats))
+        warnings.append(
+            f"imu: hangs on one reading: stretches: {len(stretches)}, the longest {t[last] - t[first]:.2f} s at "
+            f"{t[first]:.2f} s; its {len(repeats)} repeats are left out"
+        )
+        if len(series) < LEAST_IMU:
+            raise LogError(f"{log.path}: {topic}: {warnings[-1]}, and {len(series)} samples remain; check the IMU")
+    steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
     counts = Counts(
         received=c.received,
         used=len(series),
@@ -72,16 +86,6 @@ def imu_steps(
         nonfinite=c.nonfinite,
         outage=int(outage.sum()),
     )
-    steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
-    if (fault := sanity.fault(steps)) is not None:
-        raise LogError(f"{log.path}: {topic}: {fault}")
-    if stretches := sanity.stuck(series):
-        t = seconds(series.t_ns, steps.t0_ns)
-        first, last = max(stretches, key=lambda s: t[s[1]] - t[s[0]])
-        warnings.append(
-            f"imu: hangs on one reading: stretches: {len(stretches)}, the longest {t[last] - t[first]:.2f} s at "
-            f"{t[first]:.2f} s; nothing it says there is true"
-        )
     if steps.gaps:
         lengths = [end - start for start, end in steps.gaps]
         longest = int(np.argmax(lengths))

@@ -1,0 +1,198 @@
+"""Faults done to a log: told exactly, and survived by every estimator with counts that add up and the fault named."""
+
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from datasets import faults
+from datasets.__main__ import main
+from tbmfg import pipeline
+from tbmfg.errors import TbmfgError
+from tbmfg.mcap import read_log
+from tests.problems import drive
+
+PRISM, IMU, ODOMETER = "/prism/position", "/imu/data", "/odometer"
+SECONDS = 16.0
+ESTIMATORS = ("batch", "ins", "fixed-lag", "isam2")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A short drive as a file."""
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    drive(5, SECONDS).write(path)
+    return path
+
+
+def corrupted(log, tmp_path, *specs, seed=2):
+    """The log with faults: its file, and what was told of the first of them."""
+    out = tmp_path / "corrupt.mcap"
+    told = faults.corrupt(log, out, [faults.parse(spec) for spec in specs], seed=seed)
+    assert json.loads(read_log(out).attachments["faults.json"]) == {"seed": seed, "faults": told}
+    return out, told[0]
+
+
+def messages(path, topic=PRISM):
+    """(log time, payload) of every message of a topic, and the payloads of all the others."""
+    from tbmfg.mcap.into import records
+
+    found = [(channel.topic, at, bytes(record.data)) for at, _, (_, channel, record) in records([path])]
+    return [one[1:] for one in found if one[0] == topic], [one for one in found if one[0] != topic]
+
+
+# ---- what is done ----
+
+
+@pytest.mark.parametrize("kind", faults.KINDS)
+def test_only_the_messages_told_of_are_changed(log, tmp_path, kind):
+    out, told = corrupted(log, tmp_path, kind)
+    again, _ = corrupted(log, tmp_path, kind)
+    assert again.read_bytes() == out.read_bytes()
+    before, others = messages(log)
+    after, same = messages(out)
+    assert others == same
+    original = read_log(log).series[PRISM]
+    hit = np.isin(original.t_ns, told["stamps_ns"])
+    assert 0 < hit.sum() == len(told["stamps_ns"]) < told["messages"] == len(before)
+    untouched = {payload for (_, payload), bad in zip(before, hit, strict=True) if not bad}
+    assert untouched <= {payload for _, payload in after}
+    if kind not in ("shuffle", "duplicate"):
+        assert not {payload for (_, payload), bad in zip(before, hit, strict=True) if bad} & {p for _, p in after}
+
+
+def test_each_kind_does_what_it_says(log, tmp_path):
+    def read(spec):
+        out, told = corrupted(log, tmp_path, spec)
+        series = read_log(out).series[PRISM]
+        return series, np.isin(original.t_ns, told["stamps_ns"]), told
+
+    original = read_log(log).series[PRISM]
+    series, hit, _ = read("gross:share=0.3,size=2")
+    assert hit.mean() == pytest.approx(0.3, abs=0.15)
+    away = series["point"][hit] - series["point"][hit].mean(axis=0)
+    assert np.linalg.norm(away, axis=1).max() < 0.02, "all of one other reflector"
+    assert np.linalg.norm(series["point"][hit] - original["point"][hit], axis=1).min() > 1.0
+    series, hit, _ = read("bias:size=0.1,start=4,end=6")
+    assert_array_equal(hit, (original.t_ns - original.t_ns[0] >= 4e9) & (original.t_ns - original.t_ns[0] <= 6e9))
+    np.testing.assert_allclose(np.linalg.norm(series["point"][hit] - original["point"][hit], axis=1), 0.1)
+    series, hit, _ = read("frozen:start=4,end=6")
+    assert not np.ptp(series["point"][hit], axis=0).any()
+    series, hit, _ = read("gap:start=4,end=6")
+    assert_array_equal(series.t_ns, original.t_ns[~hit])
+    series, hit, _ = read("clock:start=4,end=20,step=0.5")
+    assert_array_equal(series.t_ns, original.t_ns + 500_000_000 * hit)
+    series, hit, _ = read("nan:bursts=2,length=3")
+    assert series.counts.nonfinite == hit.sum() <= 6
+    series, hit, _ = read("duplicate:share=0.2")
+    assert series.counts.duplicate == hit.sum()
+    series, hit, _ = read("shuffle:reach=4")
+    assert series.counts.disordered > 0
+    assert_array_equal(series["point"], original["point"])
+
+
+def test_several_faults_on_several_topics(log, tmp_path, capsys):
+    out = tmp_path / "both.mcap"
+    specs = ["--fault", "gap:start=4,end=6", "--fault", f"bias:topic={ODOMETER},size=0.2", "--fault", "nan"]
+    assert main(["corrupt", str(log), "-o", str(out), "--seed", "3", *specs]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(",")[0] for line in lines] == [f"{PRISM}: gap", f"{ODOMETER}: bias", f"{PRISM}: nan"]
+    told = json.loads(read_log(out).attachments["faults.json"])["faults"]
+    assert told[2]["messages"] == told[0]["messages"] - len(told[0]["stamps_ns"])
+    assert "rig.yaml" in read_log(out).attachments
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("fire", "no such kind; there are gross, bias"),
+        ("gross:share=much", "share should be a number"),
+        ("gross:step=1", "no key step; there are topic, start, end, share, size"),
+        ("gap:topic=/none", "no topic /none to make wrong; there are /imu/mag, "),
+    ],
+)
+def test_a_wrong_fault_is_one_line(log, tmp_path, capsys, spec, message):
+    assert main(["corrupt", str(log), "-o", str(tmp_path / "x.mcap"), "--fault", spec]) == 1
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert printed.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+# ---- what the estimators make of it ----
+
+# Fault, whose counts or words tell of it, and position error allowed: a clean log leaves 12 mm, mostly of its arm.
+# Who knows the past alone may follow a sensor that is wrong for long, here by 0.1 m, or 0.05 m by a clock at 0.1 m/s.
+MATRIX = [
+    ("gross:share=0.1", "gated", 0.02),
+    ("gross:share=0.3", "gated", 0.02),
+    ("bias:size=0.1,start=6,end=9", "gated", 0.1),
+    ("frozen:start=6,end=9", "gated", 0.1),
+    ("gap:start=6,end=9", None, 0.02),
+    ("clock:start=6,end=9", "gated", 0.1),
+    ("nan", "nonfinite", 0.02),
+    ("duplicate", "duplicate", 0.02),
+    ("shuffle", None, 0.02),
+]
+IMU_MATRIX = [
+    ("gap:start=6,end=7", "gaps: 1", 0.02),
+    ("frozen:start=6,end=7", "hangs on one reading", 0.02),
+    ("clock:start=6,end=7", "gaps: 1", 0.05),
+    ("nan:bursts=3,length=20", "gaps: ", 0.02),
+    ("duplicate", None, 0.02),
+    ("shuffle", None, 0.02),
+]
+
+
+def estimated(path, names):
+    """Result and summary by estimator; counts add up, everything is finite."""
+    session = pipeline.open_session(str(path))
+    for name in names:
+        result, summary = session.estimate(name)
+        for count in summary["sensors"].values():
+            assert count["received"] == sum(value for part, value in count.items() if part != "received")
+        assert np.isfinite(result.trajectory.position_n).all()
+        assert np.isfinite(result.trajectory.cov).all()
+        yield name, result, summary
+
+
+@pytest.mark.parametrize(("spec", "part", "allowed_m"), MATRIX)
+def test_a_prism_that_fails(log, tmp_path, spec, part, allowed_m):
+    path, told = corrupted(log, tmp_path, spec)
+    for name, result, summary in estimated(path, ESTIMATORS):
+        last = result.smoothed or result.trajectory
+        assert np.isfinite(last.cov).all()
+        assert summary["metrics"]["position_rms_m"] < (0.02 if name == "batch" else allowed_m), name
+        counts = summary["sensors"]["prism"]
+        if part in ("nonfinite", "duplicate"):
+            assert counts[part] == len(told["stamps_ns"])
+        elif part == "gated":
+            assert counts["gated"] >= 0.7 * len(told["stamps_ns"]), name
+            stretches = [one for one in summary["intervals"] if (one["sensor"], one["kind"]) == ("prism", "gated")]
+            assert stretches or told["kind"] == "gross", name
+        else:
+            assert counts["gated"] <= 1, name
+
+
+@pytest.mark.parametrize(("spec", "words", "allowed_m"), IMU_MATRIX)
+def test_an_imu_that_fails(log, tmp_path, spec, words, allowed_m):
+    kind, _, rest = spec.partition(":")
+    path, _ = corrupted(log, tmp_path, f"{kind}:topic={IMU}" + f",{rest}" * bool(rest))
+    for name, _, summary in estimated(path, ("batch", "ins")):
+        assert summary["metrics"]["position_rms_m"] < allowed_m, name
+        assert summary["metrics"]["attitude_rms_deg"] < 0.5, name
+        assert words is None or any(line.startswith("imu: ") and words in line for line in summary["warnings"]), name
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_everything_at_once_ends_in_a_result_or_in_one_line(log, tmp_path, seed):
+    topics = (PRISM, IMU, ODOMETER, "/imu/mag")
+    rng = np.random.default_rng(seed)
+    specs = [f"{kind}:topic={rng.choice(topics)}" for kind in rng.permutation(list(faults.KINDS))]
+    path, _ = corrupted(log, tmp_path, *specs, seed=seed)
+    try:
+        ended = [name for name, _, _ in estimated(path, ("batch", "ins"))]
+    except TbmfgError as error:
+        ended = str(error).splitlines()
+    assert ended == ["batch", "ins"] or len(ended) == 1
