@@ -43,7 +43,8 @@ SCENARIOS = {
     # every error a draw from the estimators' model
     "tbm-drive-nominal": ("tbm-drive", ("vibration=0", "slide=1", "sensors.imu.noise_factor=1")),
     "shearer-cut": ("shearer-cut", ()),
-    "shaft-descend-nominal": ("shaft-descend", ("nominal=1",)),
+    "shaft-dynamic-nominal": ("shaft-dynamic", ("nominal=1", "sensors.imu.noise_factor=1")),
+    "shaft-descend-nominal": ("shaft-descend", ("nominal=1", "sensors.imu.noise_factor=1")),
 }
 NOMINAL = ("tbm-drive-nominal", "shearer-cut", "shaft-descend-nominal")
 LIMITS = {"batch": 1.05, "ins": 1.15}  # of errors over their bounds

@@ -2,7 +2,7 @@
 
 It stands, speeds up over 15 s, goes on at 3.90 m/s to the bottom or at 1.33 m/s for 300 s, slows down over 15 s, and
 stands. The guide rails shake it, the more the faster it goes. There is no laser on board: depth comes from the
-barometer, and how warm the air in the shaft is, is not known to better than ``air_sd_k``, which cannot be told from a
+barometer, and how warm the air in the shaft is, is not known to better than the rig says, which cannot be told from a
 scale of depth. ``survey_sd_m`` above 0 puts a surveyed position at the log's end into the rig, a depth known so well.
 """
 
@@ -36,12 +36,11 @@ def fast(
     seed: int,
     duration: float = FAST_S,
     vibration: float = 1.0,
-    air_sd_k: float = 2.0,
     survey_sd_m: float = 0.0,
     nominal: int = 0,
 ) -> Simulation:
     """A cage going down 430 m at 3.90 m/s."""
-    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, vibration, air_sd_k, survey_sd_m, nominal)
+    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, vibration, survey_sd_m, nominal)
 
 
 def slow(
@@ -50,12 +49,11 @@ def slow(
     seed: int,
     duration: float = SLOW_S,
     vibration: float = 1.0,
-    air_sd_k: float = 2.0,
     survey_sd_m: float = 0.0,
     nominal: int = 0,
 ) -> Simulation:
     """A cage going down 419 m at 1.33 m/s."""
-    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, vibration, air_sd_k, survey_sd_m, nominal)
+    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, vibration, survey_sd_m, nominal)
 
 
 def ride(
@@ -66,7 +64,6 @@ def ride(
     seed: int,
     duration: float,
     vibration: float,
-    air_sd_k: float,
     survey_sd_m: float,
     nominal: int,
 ) -> Simulation:
@@ -79,7 +76,7 @@ def ride(
         end = motion(np.array([duration])).position[0] + survey_sd_m * stream(seed, "survey").standard_normal(3)
         mark = SurveyPoint(at="end", position_m=tuple(end.tolist()), sigma_m=survey_sd_m)
         machine = machine.model_copy(update={"survey": (mark,)})
-    return shaft.record(name, motion, machine, seed, duration, 0.0, 0.0, air_sd_k, nominal, without="laser")
+    return shaft.record(name, motion, machine, seed, duration, 0.0, 0.0, nominal, without="laser")
 
 
 def pace(t_s: Floats, speed_mps: float, whole_s: float) -> Floats:

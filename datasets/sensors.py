@@ -202,9 +202,9 @@ def barometer(
     update_hz: float,
     noise_pa: float | None,
     drift_pa_per_h: float,
-    air_sd_k: float,
 ) -> Sensed:
-    """Air pressure, Pa, in a shaft whose air is not as warm as its thermometer says: ``air_k`` of ``drawn``.
+    """Air pressure, Pa, in a shaft whose air is not as warm as its thermometer says: ``air_k`` of ``drawn``, by which
+    heights have a scale error of the rig's sd.
 
     The unit converts ``update_hz`` times a second and is read ``rate_hz`` times. ``drift_pa_per_h`` is the sd of the
     weather's trend. Without ``noise_pa`` every error is the rig's: each reading is fresh, its noise white, its drift
@@ -214,7 +214,7 @@ def barometer(
     depth = -scene.motion(t_ns * 1e-9).position[:, 2]
     warmth, weather, trend = rng.standard_normal(3)
     white, steps = rng.standard_normal((len(t_ns), 2)).T
-    air_k = AIR_K + air_sd_k * warmth
+    air_k = AIR_K / (1.0 + (sensor.scale_sd or 0.0) * warmth)
     middle_m = (depth.min() + depth.max()) / 2
     gravity = -scene.gravity_n[2]
     per_metre = 101325.0 * gravity / (AIR_GAS * AIR_K)
@@ -258,23 +258,22 @@ def laser(
     rng: np.random.Generator,
     *,
     rate_hz: float,
-    tilt_sd_deg: float,
     dropout: float,
     resolution_m: float = 0.02e-3,
     half_width_m: float = 0.03,
 ) -> Sensed:
     """The spot of a plumb laser on a detector, x and y in its axes, m: where line and tilted plane meet.
 
-    The line goes through n's origin, out of plumb by ``tilt_n`` of ``drawn``, m/m in n's x and y. The spot jitters
-    with the rig's sigma, is read in steps and no farther out than the detector is wide; dust hides a share
-    ``dropout`` of the readings, which then are not sent.
+    The line goes through n's origin, out of plumb by ``tilt_n`` of ``drawn``, m/m in n's x and y; the reading's zero is
+    off by ``zero_m``. The spot jitters with the rig's sigma, is read in steps and no farther out than the detector is
+    wide; dust hides a share ``dropout`` of the readings, which then are not sent.
     """
     t_ns = ticks(scene.duration_s, rate_hz)
     truth = scene.motion(t_ns * 1e-9)
-    tilt = np.radians(tilt_sd_deg) * rng.standard_normal(2)
+    tilt, zero = np.array([[sensor.tilt_sd or 0.0], [sensor.offset_sd or 0.0]]) * rng.standard_normal((2, 2))
     *white, dust = rng.standard_normal((len(t_ns), 3)).T
     spot = spot_on_detector(truth, np.array(sensor.T_bd.xyz_m), sensor.T_bd.R, np.append(tilt, 1.0))
-    noisy = spot + 1e-3 * sensor.sigma_mm * np.column_stack(white)
+    noisy = spot + zero + 1e-3 * sensor.sigma_mm * np.column_stack(white)
     read = np.clip(resolution_m * np.round(noisy / resolution_m), -half_width_m, half_width_m)
     seen = ndtr(dust) >= dropout
 
@@ -284,7 +283,7 @@ def laser(
             sensor.topic, "geometry_msgs/msg/PointStamped", START_NS + t_ns[rows], {"point": points}, "detector"
         )
 
-    return Sensed(series(seen, read), series(np.ones_like(seen), spot), {"tilt_n": tilt})
+    return Sensed(series(seen, read), series(np.ones_like(seen), spot), {"tilt_n": tilt, "zero_m": zero})
 
 
 def spot_on_detector(truth: Kinematics, xyz_b: Floats, R_bd: Floats, along_n: Floats) -> Floats:

@@ -12,8 +12,8 @@ whose displacement falls with their number and is, with the rig's detector, what
 2.4 mm rms in both axes together), and a band of 20 to 200 Hz that fills up to 0.45 and 0.9 m/s^2 rms per axis. A unit
 read 50 times a second takes means over its periods: it folds what remains of the band.
 
-``nominal=1`` follows the estimators' model: no vibration, no motor, no dust, warmth as the thermometer says, and every
-noise as the rig has it. Otherwise the makers' figures hold where the rig has an allowance: 15 nT for the magnetometer
+``nominal=1`` follows the estimators' model: no vibration, no motor, no dust, and every noise as the rig has it.
+Otherwise the makers' figures hold where the rig has an allowance: 15 nT for the magnetometer
 beside the motor's field, 0.012 mbar for the barometer.
 """
 
@@ -34,7 +34,6 @@ RATE_HZ = 50.0
 STEP_S = 0.05  # of the path's samples; the spline through them is the truth
 PIVOT_B = np.array([0.0, 0.0, -1.0])  # what the machine tilts about
 DIP_DEG = 58.0
-LASER_TILT_DEG = 0.005  # 0.1 mm per m out of plumb
 
 DEG = np.pi / 180
 
@@ -74,13 +73,12 @@ def static(
     duration: float = 40.0,
     motor_ut: float = 0.0,
     dropout: float = 0.0,
-    air_sd_k: float = 2.0,
     nominal: int = 0,
 ) -> Simulation:
     """A shaft boring machine standing level."""
     t_s = times(duration)
     motion = Motion(tilting(t_s, np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))))
-    return record("shaft-static", motion, machine, seed, duration, motor_ut, dropout, air_sd_k, nominal)
+    return record("shaft-static", motion, machine, seed, duration, motor_ut, dropout, nominal)
 
 
 def low(
@@ -91,12 +89,11 @@ def low(
     vibration: float = 1.0,
     motor_ut: float = 2.0,
     dropout: float = 0.05,
-    air_sd_k: float = 2.0,
     nominal: int = 0,
 ) -> Simulation:
     """The shaft boring machine cutting on the spot at 10 turns a minute."""
     motion = on_the_spot(LOW, duration, vibration * (not nominal), stream(seed, "vibration"))
-    return record("shaft-low", motion, machine, seed, duration, motor_ut, dropout, air_sd_k, nominal)
+    return record("shaft-low", motion, machine, seed, duration, motor_ut, dropout, nominal)
 
 
 def high(
@@ -107,12 +104,11 @@ def high(
     vibration: float = 1.0,
     motor_ut: float = 2.0,
     dropout: float = 0.05,
-    air_sd_k: float = 2.0,
     nominal: int = 0,
 ) -> Simulation:
     """The shaft boring machine cutting on the spot at 40 turns a minute."""
     motion = on_the_spot(HIGH, duration, vibration * (not nominal), stream(seed, "vibration"))
-    return record("shaft-high", motion, machine, seed, duration, motor_ut, dropout, air_sd_k, nominal)
+    return record("shaft-high", motion, machine, seed, duration, motor_ut, dropout, nominal)
 
 
 def dynamic(
@@ -123,7 +119,6 @@ def dynamic(
     rocking_deg: float = 0.5,
     motor_ut: float = 2.0,
     dropout: float = 0.05,
-    air_sd_k: float = 2.0,
     nominal: int = 0,
 ) -> Simulation:
     """The shaft boring machine turning to and fro within 17 degrees, rocking."""
@@ -131,7 +126,7 @@ def dynamic(
     wave = np.sin(2 * np.pi * np.multiply.outer(t_s, [[0.07, 0.19], [0.09, 0.16]]) + phase).sum(axis=2)
     rpy = np.column_stack([rocking_deg * DEG * wave, turning(t_s)])
     motion = Motion(tilting(t_s, np.zeros((len(t_s), 3)), rpy))
-    return record("shaft-dynamic", motion, machine, seed, duration, motor_ut, dropout, air_sd_k, nominal)
+    return record("shaft-dynamic", motion, machine, seed, duration, motor_ut, dropout, nominal)
 
 
 def descend(
@@ -142,7 +137,6 @@ def descend(
     vibration: float = 1.0,
     motor_ut: float = 2.0,
     dropout: float = 0.05,
-    air_sd_k: float = 2.0,
     nominal: int = 0,
 ) -> Simulation:
     """The shaft boring machine sinking, drifting off and steered back."""
@@ -152,7 +146,7 @@ def descend(
     cutting = Spline(t_s, (feed / 0.01)[:, None])
     shaking = cutter(LOW, vibration * (not nominal), cutting, stream(seed, "vibration"))
     motion = Motion(tilting(t_s, way, rpy), (shaking,))
-    return record("shaft-descend", motion, machine, seed, duration, motor_ut, dropout, air_sd_k, nominal)
+    return record("shaft-descend", motion, machine, seed, duration, motor_ut, dropout, nominal)
 
 
 def record(
@@ -163,7 +157,6 @@ def record(
     duration: float,
     motor_ut: float,
     dropout: float,
-    air_sd_k: float,
     nominal: int,
     without: str = "",
 ) -> Simulation:
@@ -184,9 +177,8 @@ def record(
             update_hz=20.0,
             noise_pa=1.2 if own else None,
             drift_pa_per_h=10.0,
-            air_sd_k=air_sd_k * own,
         ),
-        "laser": partial(laser, rate_hz=RATE_HZ, tilt_sd_deg=LASER_TILT_DEG * own, dropout=dropout * own),
+        "laser": partial(laser, rate_hz=RATE_HZ, dropout=dropout * own),
     }
     sensors.pop(without, None)
     return simulate(name, motion, machine, sensors, seed=seed, duration_s=duration, truth_rate_hz=RATE_HZ)

@@ -83,14 +83,16 @@ def test_spot_by_hand(body, along, xyz_b, expected_mm):
 
 
 def test_spot_lies_on_the_line_and_jitters_as_the_rig_says():
-    simulation = made("shaft-dynamic", duration=20.0, nominal=1)
+    simulation = made("shaft-dynamic", duration=20.0, settings=("sensors.laser.offset_sd_mm=1",), nominal=1)
     clean = simulation.clean["laser"]
     truth = true_at(simulation, "/laser/spot")
     point_n = truth.position + np.einsum("nij,nj->ni", truth.R, clean["point"] @ DETECTOR + [0, 0, 0.1])
     assert np.abs(point_n[:, 2]).max() > 0.09
-    assert_allclose(point_n[:, :2], 0.0, atol=1e-15)  # nominal: the line is plumb
+    drawn = simulation.drawn["laser"]
+    assert np.abs(drawn["zero_m"]).max() > 1e-4
+    assert_allclose(point_n[:, :2], point_n[:, 2:] * drawn["tilt_n"], atol=1e-15)
     noise = log_of(simulation, "/laser/spot")["point"] - clean["point"]
-    assert_chi_square(noise[:, :2] / np.hypot(0.2e-3, 0.02e-3 / np.sqrt(12)))
+    assert_chi_square((noise[:, :2] - drawn["zero_m"]) / np.hypot(0.2e-3, 0.02e-3 / np.sqrt(12)))
 
 
 def test_spot_is_clipped_where_the_detector_ends():

@@ -16,7 +16,7 @@ SETTINGS = ("sensors.imu.noise_factor=1",)
 
 @cache
 def ride(seed: int, survey_sd_m: float):
-    options = {"vibration": 0.0, "survey_sd_m": survey_sd_m, "air_sd_k": 2.0}
+    options = {"vibration": 0.0, "survey_sd_m": survey_sd_m}
     return datasets.make("cage-fast", seed=seed, duration=40.0, **options)
 
 
