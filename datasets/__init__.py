@@ -11,7 +11,8 @@ one side is seen: rotations, gravity and Earth rate, integration, sensor models.
 - ``tbm``       a machine: how it moves, how it shakes, what it carries; ``tbm_static``: the same standing still
 - ``shearer``   another; ``shearer_magfault``: the same beside steel; ``shearer_panel``: along the face and back
 - ``shaft``     a shaft boring machine, standing, cutting, turning, sinking; ``cage``: its unit on a cage in the shaft
-- ``worlds``, ``lidar``  places underground, and how a LiDAR sees them: ``tbm_tunnel``, ``tbm_roadway``
+- ``worlds``, ``lidar``  places underground, and how a LiDAR sees them: ``tbm_tunnel``, ``tbm_roadway``;
+  ``tbm_scenes``, ``tbm_ablation``: the experiments of a paper there
 - ``faults``    what goes wrong, done to a log on purpose: ``python -m datasets corrupt LOG -o FILE --fault KIND``
 - ``recordings``  what was really measured, from the npz it is packaged in
 """
@@ -45,6 +46,9 @@ MACHINES = {
     "cage-slow": "datasets.cage:slow",
     "tbm-tunnel": "datasets.tbm_tunnel:make",
     "tbm-roadway": "datasets.tbm_roadway:make",
+    "tbm-clean": "datasets.tbm_scenes:clean",
+    "tbm-dust": "datasets.tbm_scenes:dust",
+    "tbm-ablation": "datasets.tbm_ablation:make",
     "shearer-cut": "datasets.shearer:make",
     "shearer-magfault": "datasets.shearer_magfault:make",
     "shearer-panel": "datasets.shearer_panel:make",

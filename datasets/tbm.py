@@ -137,14 +137,14 @@ class Plan:
         return Plan(t_s, *np.zeros((4, len(t_s))))
 
     @staticmethod
-    def over(duration_s: float) -> Plan:
-        """Standing, then rounds; from a second before the log to a second after it."""
+    def over(duration_s: float, moves: tuple[tuple[float, float, float], ...] = ROUND) -> Plan:
+        """Standing, then ``moves`` there and back; from a second before the log to a second after it."""
         t_s = np.arange(-1.0, duration_s + 1.0 + STEP_S, STEP_S)
         speed, turn_rate, moving = np.zeros((3, len(t_s)))
         stand_s = min(STAND_S, duration_s / 8)  # a short log shows motion too
-        back = tuple((length, -metres, -turn) for length, metres, turn in reversed(ROUND))
+        back = tuple((length, -metres, -turn) for length, metres, turn in reversed(moves))
         begin = stand_s
-        for length, metres, turn in cycle(ROUND + back):
+        for length, metres, turn in cycle(moves + back):
             if begin >= t_s[-1]:
                 break
             here = slice(*np.searchsorted(t_s, [begin, begin + length]))

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from datasets import tbm
-from datasets.lidar import lidar
+from datasets.lidar import Dust, lidar
 from datasets.motion import Motion
 from datasets.sensors import imu, magnetometer, odometer, prism
 from datasets.simulate import Simulation, simulate, stream
@@ -50,22 +50,13 @@ def make(
 ) -> Simulation:
     """``dust`` is the extinction in 1/m, in the air between the shares ``dust_begin`` and ``dust_end`` of the log."""
     plan = tbm.Plan.over(duration)
-
-    def extinction(t_s: Floats) -> Floats:
-        since, left = t_s - dust_begin * duration, dust_end * duration - t_s
-        return dust * tbm.smooth_step(since / RISE_S) * tbm.smooth_step(left / RISE_S)
-
-    def visibility(t_s: Floats) -> Floats:
-        return np.exp(-2 * extinction(t_s) * DUSTY_M)
-
+    extinction, visibility = air(dust, dust_begin * duration, dust_end * duration)
     sensors = {
         "imu": partial(imu, rate_hz=imu_rate_hz),
-        "prism": partial(prism, rate_hz=prism_rate_hz, visibility=visibility if dust else None),
+        "prism": partial(prism, rate_hz=prism_rate_hz, visibility=visibility),
         "odometer": partial(odometer, rate_hz=odometer_rate_hz),
         "magnetometer": partial(magnetometer, rate_hz=magnetometer_rate_hz),
-        "lidar": partial(
-            lidar, world=world(seed), rate_hz=lidar_rate_hz, columns=columns, dust=extinction if dust else None
-        ),
+        "lidar": partial(lidar, world=world(seed), rate_hz=lidar_rate_hz, columns=columns, dust=extinction),
     }
     travel = tbm.path(plan, machine.sensors["odometer"].arm, 0.0, stream(seed, "slide"))
     motion = Motion(travel, tbm.shaking(plan, vibration, stream(seed, "vibration")) if vibration else ())
@@ -78,6 +69,18 @@ def make(
         duration_s=duration,
         truth_rate_hz=truth_rate_hz or imu_rate_hz,
     )
+
+
+def air(dust: float, begin_s: float, end_s: float) -> tuple[Dust | None, Dust | None]:
+    """Extinction 1/m of the air, ``dust`` between two times, and the share of fixes that come through it; None and None
+    of clean air."""
+    if not dust:
+        return None, None
+
+    def extinction(t_s: Floats) -> Floats:
+        return dust * tbm.smooth_step((t_s - begin_s) / RISE_S) * tbm.smooth_step((end_s - t_s) / RISE_S)
+
+    return extinction, lambda t_s: np.exp(-2 * extinction(t_s) * DUSTY_M)
 
 
 def world(seed: int) -> Mesh:
