@@ -18,6 +18,7 @@ from __future__ import annotations
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "attitude": "benchmarks.attitude",
+    "gyrocompass": "benchmarks.gyrocompass",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, runs, speed
+from benchmarks import accuracy, gate, gyrocompass, runs, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -122,6 +122,30 @@ def test_biases_are_those_of_the_sample_that_ends_at_the_keyframe():
     bias_acc, bias_gyro = runs.true_biases(simulation, stamps[[3, 700]] + 1000)
     np.testing.assert_array_equal(bias_acc, simulation.drawn["imu"]["bias_acc"][[3, 700]])
     np.testing.assert_array_equal(bias_gyro, simulation.drawn["imu"]["bias_gyro"][[3, 700]])
+
+
+# ---- gyrocompass ----
+
+
+def test_a_gyrocompass_is_held_to_theory_and_to_its_own_sd():
+    rng = np.random.default_rng(8)
+    honest = [
+        gyrocompass.Found("ins", seed, 8e-3 * z, 8e-3, 8.05e-3) for seed, z in enumerate(rng.standard_normal(100))
+    ]
+    rows = by_metric(gyrocompass.summarise(honest))
+    assert rows["heading"].mean == pytest.approx(8.0, rel=0.25)
+    assert all(row.inside is not False for row in rows.values())
+    sure = by_metric(gyrocompass.summarise([replace(one, sd=4e-3) for one in honest]))
+    assert not sure["heading_sd"].inside
+    assert not sure["heading_within_3sd"].inside
+    assert not by_metric(gyrocompass.summarise([*honest, replace(honest[0], failure="no north")]))["failed"].inside
+
+
+def test_gyrocompass_runs():
+    [found] = gyrocompass.run(gyrocompass.Job(1, 60.0, ("ins",)))
+    assert not found.failure
+    assert abs(found.error) < 4.0 * found.sd
+    assert found.sd > 0.9 * found.theory, "nobody knows north better than the gyro's bias lets"
 
 
 # ---- rows ----
