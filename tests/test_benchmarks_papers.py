@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 import datasets
 from benchmarks.__main__ import main
-from benchmarks.papers import sbm, shearer
-from benchmarks.papers.trials import Method, Outcome, Outcomes, confidence
+from benchmarks.papers import Plan, sbm, shearer, tbm
+from benchmarks.papers.trials import Method, Outcome, Outcomes, Trial, confidence, run
 from benchmarks.rows import read_rows
 from benchmarks.runs import true_states
 from tbmfg.evaluation.metrics import chi_square_bounds
@@ -221,6 +221,27 @@ def test_errors_of_the_shaft_machine_are_those_of_angles_detector_and_depth():
     found = sbm.errors(simulation, Result("ins", path), truth)
     expected = {"roll": 1.0, "pitch": 2.0, "yaw": 3.0, "displacement": 4.0, "depth": 5.0, "speed": 6.0}
     assert {name: value for name, (value, _) in found.items()} == pytest.approx(expected)
+
+
+def test_the_pump_turns_the_heading_of_a_mean_and_not_of_a_rotation():
+    rows = {row.key: row for row in tbm.static(Plan(range(1), 8.0, 1))}
+    turned = {name: rows["static", name, "yaw, pump on - off"] for name in (tbm.PLAIN, tbm.PRINTED, tbm.ROTATION)}
+    assert turned[tbm.PLAIN].published == 0.38
+    assert turned[tbm.ROTATION].mean < 0.2 * turned[tbm.PLAIN].mean
+    # modes of a skewed waveform take many times the Earth's rate with them
+    assert turned[tbm.PRINTED].mean > 1.0
+    reduction = rows["static", tbm.ROTATION, "less than the mean"]
+    assert reduction.mean == pytest.approx(100 * (1 - turned[tbm.ROTATION].mean / turned[tbm.PLAIN].mean))
+    assert reduction.inside
+
+
+def test_the_roadheaders_drives_are_measured():
+    """On a drive without its LiDAR, which takes longer than all else."""
+    trial = Trial("dust", "tbm-drive", 0, 12.0, tbm.METHODS[:2], tbm.errors, options={"imu_rate_hz": 100.0})
+    rows = {row.key: row for row in Outcomes(run(trial)).rows("dust", {}, {})}
+    assert rows["dust", "tbm-ins-ts", "failed"].mean == 0
+    assert 0 < rows["dust", "tbm-ins-ts", "position_rms"].mean < 0.1
+    assert rows["dust", "ins", "over 0.3 m"].mean == 0
 
 
 def test_wrong_papers_and_numbers_are_refused(capsys):

@@ -24,6 +24,7 @@ from tbmfg.errors import TbmfgError
 PAPERS = {
     "shearer": "benchmarks.papers.shearer",
     "sbm": "benchmarks.papers.sbm",
+    "tbm": "benchmarks.papers.tbm",
 }
 
 
