@@ -99,7 +99,7 @@ def test_compensated_points_lie_on_the_walls_from_the_last_pose():
     t_ns, cloud = list(simulation.clean["lidar"])[40]
     start_s = (t_ns - simulation.start_ns) * 1e-9
     points, own = np.column_stack([cloud[axis] for axis in "xyz"]).astype(float), start_s + cloud["time"]
-    moved = compensate(points, own, own.max(), motion, np.zeros(3))
+    moved = compensate(points, own, own.max(), motion, np.zeros(3), np.zeros(3))
     true = simulation.truth(own)
     last = simulation.truth(own.max()[None])
     in_n = true.position + np.einsum("nij,nj->ni", true.R, points @ mounting.R.T + mounting.xyz)
@@ -214,8 +214,62 @@ def test_scans_without_a_mounting_or_times_are_said():
 
         def __iter__(self):
             for t_ns, cloud in simulation.clouds[0]:
-                yield t_ns, cloud | {"time": np.zeros_like(cloud["time"])}
+                x = cloud["x"].copy()
+                x[::5] = np.nan
+                yield t_ns, cloud | {"time": np.zeros_like(cloud["time"]), "x": x}
 
     problem = prepare(replace(log, clouds={"/points": Equal()}), simulation.rig)
     assert any("one time" in warning for warning in problem.warnings)
+    assert any("20% not finite" in warning for warning in problem.warnings)
+    assert any("a direction untold" in warning for warning in problem.warnings)
     assert any(rows.sensor == "lidar" for rows in problem.rows)
+
+
+def room(rng, count: int):
+    """Points on the walls, the floor and a block of a room of 8 x 6 x 3 m, (n, 3) m."""
+    points = rng.uniform([-4.0, -3.0, -1.0], [4.0, 3.0, 2.0], (count, 3))
+    face = rng.integers(0, 4, count)
+    points[face == 0, 2] = -1.0
+    points[face == 1, 0] = 4.0
+    points[face == 2, 1] = 3.0
+    points[face == 3] = points[face == 3] * [0.25, 0.25, 1.0] - [2.5, 1.5, 0.0]
+    points[face == 3, 1] = -1.0
+    return points + 0.01 * rng.standard_normal((count, 3))
+
+
+def test_a_turn_that_nobody_foretold_is_found():
+    rng = np.random.default_rng(7)
+    odometry = Odometry(SENSOR, Blind())
+    for k in range(6):
+        assert odometry.register(clouds.Scan(0, room(rng, 6000), None, 0, 0, 0), 0.5 * k).healthy
+    R = exp_so3(np.array([0.0, 0.0, np.deg2rad(50.0)]))
+    pose = odometry.register(clouds.Scan(0, room(rng, 6000) @ R, None, 0, 0, 0), 3.0)
+    assert pose.healthy
+    assert odometry.sought == 1
+    assert_allclose(pose.R, R, atol=0.01)
+
+
+def test_a_scan_of_another_place_is_flagged_and_begins_a_map():
+    rng = np.random.default_rng(8)
+    odometry = Odometry(SENSOR, Blind())
+    for k in range(6):
+        odometry.register(clouds.Scan(0, room(rng, 6000), None, 0, 0, 0), 0.5 * k)
+    heap = np.clip(rng.standard_normal((6000, 3)), -3.0, 3.0)
+    pose = odometry.register(clouds.Scan(0, heap, None, 0, 0, 0), 3.0)
+    assert not pose.healthy
+    assert not pose.root.any()  # no step into it is told
+
+
+def test_a_lost_scan_is_no_end_of_a_step():
+    rng = np.random.default_rng(9)
+    odometry = Odometry(SENSOR, Blind())
+    for k in range(4):
+        odometry.register(clouds.Scan(0, room(rng, 6000), None, 0, 0, 0), 0.1 * k)
+    cloud = clouds.Scan(0, rng.uniform(-3.0, 3.0, (3000, 3)), None, 0, 0, 0)
+    astray = odometry.register(cloud, 0.4)
+    back = odometry.register(clouds.Scan(0, room(rng, 6000), None, 0, 0, 0), 0.5)
+    assert not astray.healthy
+    assert not astray.placed
+    # the map stood still meanwhile: the step from the last placed scan is told
+    assert back.healthy
+    assert back.root.any()

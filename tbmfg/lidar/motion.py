@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from tbmfg.geometry import log_so3
+from tbmfg.geometry import exp_so3, log_so3
 from tbmfg.timeseries import Floats
 
 NODE_S = 0.002  # between the poses that a scan is carried with
@@ -26,8 +26,10 @@ class Inertia:
     R_bl: Floats
     xyz: Floats
 
-    def poses(self, t_s: Floats, velocity_0: Floats) -> tuple[Floats, Floats]:
-        """The LiDAR's R_0l (m, 3, 3) and p_0l (m, 3) at ``t_s`` (m,); without an odometer at ``velocity_0`` m/s."""
+    def poses(self, t_s: Floats, velocity_0: Floats, rate_l: Floats) -> tuple[Floats, Floats]:
+        """The LiDAR's R_0l (m, 3, 3) and p_0l (m, 3) at ``t_s`` (m,); without an odometer at ``velocity_0`` m/s.
+
+        ``rate_l`` rad/s, how it turned last, is for who has no gyro."""
         k = np.clip(np.searchsorted(self.t_s, t_s), 1, len(self.t_s) - 1)
         k -= t_s - self.t_s[k - 1] < self.t_s[k] - t_s  # the nearest: an IMU period is shorter than a node
         R = self.R_0b[k]
@@ -42,15 +44,18 @@ class Inertia:
 class Blind:
     """Nothing is known of the motion but its last step: a LiDAR alone."""
 
-    def poses(self, t_s: Floats, velocity_0: Floats) -> tuple[Floats, Floats]:
-        """As :meth:`Inertia.poses`; no rotation."""
-        return np.tile(np.eye(3), (len(t_s), 1, 1)), velocity_0 * (t_s - t_s[0])[:, None]
+    def poses(self, t_s: Floats, velocity_0: Floats, rate_l: Floats) -> tuple[Floats, Floats]:
+        """As :meth:`Inertia.poses`; 0 is the LiDAR's frame at the first time."""
+        after = (t_s - t_s[0])[:, None]
+        return exp_so3(rate_l * after), velocity_0 * after
 
 
-def compensate(points: Floats, t_s: Floats, reference_s: float, motion: Inertia, velocity_0: Floats) -> Floats:
+def compensate(
+    points: Floats, t_s: Floats, reference_s: float, motion: Inertia | Blind, velocity_0: Floats, rate_l: Floats
+) -> Floats:
     """Points (n, 3), taken at ``t_s`` (n,), as they would have been seen at ``reference_s``; tbm_mse (27)-(29)."""
     nodes = np.linspace(t_s.min(), t_s.max(), max(2, int(np.ceil(np.ptp(t_s) / NODE_S)) + 1))
-    R, p = motion.poses(np.append(reference_s, nodes), velocity_0)
+    R, p = motion.poses(np.append(reference_s, nodes), velocity_0, rate_l)
     turn = log_so3(R[0].T @ R[1:])
     shift = (p[1:] - p[0]) @ R[0]
     return _carry(np.ascontiguousarray(points), (t_s - nodes[0]) / (nodes[1] - nodes[0]), turn, shift)

@@ -32,8 +32,8 @@ STILL = 3e-4  # m and rad: a step that ends the iteration
 class Aligned:
     """Pose R (3, 3), p (3,) of a scan in the map, ``information`` (6, 6), ``weak`` directions (6, k) that have none.
 
-    ``overlap`` is the share of the points near a plane that lie on it, ``sigma`` the noise of their distances [m],
-    ``dust`` the share without a plane among the points nearer than most that have one.
+    ``overlap`` is the share of the points near a plane that lie on it, ``support`` that of all points, ``sigma`` the
+    noise of their distances [m], ``dust`` the share without a plane among the points nearer than most that have one.
     """
 
     R: Floats
@@ -41,6 +41,7 @@ class Aligned:
     information: Floats
     weak: Floats
     overlap: float
+    support: float
     sigma: float
     dust: float
 
@@ -56,7 +57,7 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
         H, g, F, distance = linearise(points, R, p, *table, KERNEL * sigma)
         found = distance[np.isfinite(distance)]
         if len(found) < LEAST_NEAR:
-            return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, SIGMA_M[1], 1.0)
+            return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, 0.0, SIGMA_M[1], 1.0)
         sigma = float(np.clip(1.4826 * np.median(np.abs(found)), *SIGMA_M))
         ratio, V = eigh(H, F)
         weak = ratio < STANDS_OUT
@@ -72,10 +73,10 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
             break
     strength = np.where(weak, 0.0, ratio - 1.0) / sigma**2
     information = inverse.T @ (strength[:, None] * inverse)
-    overlap = float(np.mean(np.abs(found) < ON * planes.voxel))
+    on = int(np.sum(np.abs(found) < ON * planes.voxel))
     ranges, alone = np.linalg.norm(points, axis=1), np.isnan(distance)
     dust = float(np.mean(alone[ranges <= np.median(ranges[~alone])]))
-    return Aligned(R, p, information, V[:, weak], overlap, sigma, dust)
+    return Aligned(R, p, information, V[:, weak], on / len(found), on / len(points), sigma, dust)
 
 
 @njit(cache=True)

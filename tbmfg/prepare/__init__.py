@@ -60,8 +60,9 @@ def prepare(
         delays = magnetic.onto_gyro_clock(setup)
         offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
         problem = search.find(setup, offsets, tell)
-        problem.calibration |= told | delays
+        problem.calibration |= told | delays | setup.calibration
     problem.intervals = [
+        *setup.intervals,
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
         *(

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
+from tbmfg.inertial.steps import to_ns
 from tbmfg.lidar import clouds
 from tbmfg.lidar.motion import Inertia
-from tbmfg.lidar.odometry import run
+from tbmfg.lidar.odometry import Odometry, Pose
 from tbmfg.measure import Samples, nearest
+from tbmfg.prepare import turning
 from tbmfg.prepare.samples import hidden
 from tbmfg.prepare.start import Setup
 from tbmfg.rig import Lidar, Odometer, Rig, kind_of
 from tbmfg.sensors import Rows
+from tbmfg.state import Interval
 from tbmfg.timeseries import Floats, Log, seconds
 
 CARRIED_S = 0.5  # longest time that the IMU carries a keyframe to a scan
 WORTH_SAYING = 0.05  # share of the scans from which a fault is a warning
+DUSTY = 0.4  # share of the nearer points without a plane from which dust is said
 
 
 def present(log: Log, rig: Rig, without: tuple[str, ...]) -> list[str]:
@@ -30,41 +36,91 @@ def register(
     log: Log, name: str, setup: Setup, outages: tuple[tuple[str, float, float], ...], tell: Callable[[float], None]
 ) -> None:
     """Register the scans of the LiDAR ``name`` on a map, and put its poses (n, 48) among the samples of ``setup``: R,
-    p, and the square root of the information of the step from the pose before. Scans are read one by one."""
+    p, and the square root of the information of the step from the pose before. Scans are read one by one; what they
+    lacked, where they did not fit, and whether they turn as the gyro does is put beside."""
     sensor: Lidar = setup.rig.sensors[name]
-    source, steps, count = log.clouds[sensor.topic], setup.steps, setup.counts[name]
+    source, steps = log.clouds[sensor.topic], setup.steps
     stamps_s = seconds(source.t_ns, steps.t0_ns) - sensor.clock_offset
     out = hidden(name, stamps_s + sensor.clock_offset, outages)
     inside = (stamps_s >= steps.edges_s[0]) & (stamps_s <= steps.end_s)
     period_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.1
-    faults: dict[str, int] = {}
-
-    def usable() -> Iterator[tuple[clouds.Scan, float]]:
-        for k, (t_ns, fields) in enumerate(source):
-            if k % 50 == 0:
-                tell(k / len(source))
-            if inside[k] and not out[k]:
-                scan = clouds.read(t_ns, fields, sensor, period_s)
-                if scan.fault:
-                    faults[scan.fault] = faults.get(scan.fault, 0) + 1
-                yield scan, stamps_s[k]
-
-    motion = Inertia(steps.edges_s, setup.frame.R_0t, _way(setup), sensor.T_bl.R, sensor.T_bl.xyz)
-    poses = list(run(usable(), sensor, motion))
-    known = [pose for pose in poses if pose is not None and pose.t_s <= steps.end_s]
-    count.outage = int(out.sum())
-    for what, number in (
-        ("hold too few points", sum(pose is None for pose in poses)),
-        ("do not fit the map", sum(not pose.healthy for pose in known)),
-        *faults.items(),
-    ):
-        if number > WORTH_SAYING * len(poses):
-            setup.warnings.append(f"{name}: {number} of {len(poses)} scans: {what}")
-    if len(known) < 2:
-        setup.warnings.append(f"{name}: {len(known)} of {len(source)} scans can be registered; it is not used")
+    odometry = Odometry(sensor, Inertia(steps.edges_s, setup.frame.R_0t, _way(setup), sensor.T_bl.R, sensor.T_bl.xyz))
+    points, faults, few, poses = Counter(), Counter(), 0, []
+    for k, (t_ns, fields) in enumerate(source):
+        if k % 50 == 0:
+            tell(k / len(source))
+        if not inside[k] or out[k]:
+            continue
+        scan = clouds.read(t_ns, fields, sensor, period_s)
+        points.update(taken=len(scan.points), nonfinite=scan.nonfinite, zero=scan.zero, beyond=scan.beyond)
+        faults.update([scan.fault] if scan.fault else [])
+        pose = odometry.register(scan, stamps_s[k])
+        few += pose is None
+        poses += [pose] if pose is not None and pose.t_s <= steps.end_s else []
+    setup.counts[name].outage = int(out.sum())
+    asked = int((inside & ~out).sum())
+    for what, number in (("hold too few points, or repeat a time", few), *faults.items()):
+        if number > WORTH_SAYING * asked:
+            setup.warnings.append(f"{name}: {number} of {asked} scans: {what}")
+    setup.warnings += [f"{name}: {line}" for line in (*_of_points(points, sensor), *_of_poses(poses, odometry))]
+    setup.intervals += [
+        Interval(name, "lost", *(int(t) for t in to_ns(steps, np.array(ends)))) for ends in _astray(poses)
+    ]
+    placed = [pose for pose in poses if pose.placed]
+    if len(placed) < 2:
+        setup.warnings.append(f"{name}: {len(placed)} of {len(source)} scans can be registered; it is not used")
         return
-    values = np.array([np.concatenate([pose.R.ravel(), pose.p, pose.root.ravel()]) for pose in known])
-    setup.samples[name] = Samples(name, np.array([pose.t_s for pose in known]), values)
+    values = np.array([np.concatenate([pose.R.ravel(), pose.p, pose.root.ravel()]) for pose in placed])
+    setup.samples[name] = Samples(name, np.array([pose.t_s for pose in placed]), values)
+    found = turning.against_gyro(sensor, setup.samples[name], setup.frame)
+    if found is not None:
+        setup.calibration |= turning.calibrations(name, sensor, found)
+        setup.warnings += [f"{name}: {line}" for line in turning.contradictions(name, sensor, found)]
+
+
+def _of_points(points: Counter, sensor: Lidar) -> list[str]:
+    """What was left out of the scans."""
+    total = points.total()
+    if total - points["taken"] <= WORTH_SAYING * total:
+        return []
+    parts = {
+        "not finite": points["nonfinite"],
+        "at zero": points["zero"],
+        f"nearer than {sensor.min_range:g} or farther than {sensor.max_range:g} m": points["beyond"],
+    }
+    said = ", ".join(f"{number / total:.0%} {what}" for what, number in parts.items() if number)
+    return [f"of its {total} points {said}; left out"]
+
+
+def _of_poses(poses: list[Pose], odometry: Odometry) -> list[str]:
+    """Where the scans did not fit, what the walls do not tell, and dust."""
+    lines, count = [], len(poses)
+    astray = [pose for pose in poses if not pose.healthy]
+    if astray:
+        lines.append(
+            f"{len(astray)} of {count} scans do not fit the map as scans usually do, the first at {astray[0].t_s:.1f} s"
+            f"; no step into them is used, and {odometry.restarts} times the map was begun anew"
+        )
+    untold = sum(pose.weak > 0 for pose in poses if pose.healthy)
+    if untold > WORTH_SAYING * count:
+        lines.append(f"in {untold} of {count} scans the walls leave a direction untold: there the others must tell it")
+    dusty = sum(pose.dust > DUSTY for pose in poses)
+    if dusty > WORTH_SAYING * count:
+        lines.append(f"dust: in {dusty} of {count} scans over {DUSTY:.0%} of the nearer points hang in the air")
+    return lines
+
+
+def _astray(poses: list[Pose]) -> list[tuple[float, float]]:
+    """Stretches of scans that do not fit the map, s: from the last that did to the last that did not."""
+    stretches: list[tuple[float, float]] = []
+    for before, pose in pairwise(poses):
+        if pose.healthy:
+            continue
+        if stretches and stretches[-1][1] == before.t_s:
+            stretches[-1] = stretches[-1][0], pose.t_s
+        else:
+            stretches.append((before.t_s, pose.t_s))
+    return stretches
 
 
 def _way(setup: Setup) -> Floats | None:

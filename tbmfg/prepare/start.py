@@ -16,7 +16,7 @@ from tbmfg.prepare.rest import Rest
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import Parameters
 from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, Rig
-from tbmfg.state import Counts
+from tbmfg.state import Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats
 
 COURSE_S = 120.0  # of driving that a heading is taken from
@@ -44,6 +44,8 @@ class Setup:
     origin_n: Floats
     counts: dict[str, Counts]
     warnings: list[str] = field(default_factory=list)
+    calibration: dict[str, Calibrated] = field(default_factory=dict)
+    intervals: list[Interval] = field(default_factory=list)
 
 
 def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> Setup:

@@ -1,0 +1,81 @@
+"""Whether a LiDAR turns as the gyro does: clock and mounting found from made-up turns, with honest sds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy
+from tbmfg.inertial.steps import Steps
+from tbmfg.measure import Samples, gyro_frame
+from tbmfg.prepare.turning import against_gyro, contradictions
+from tbmfg.rig import Lidar
+
+SIGMA = 5e-4  # rad, of a pose
+DT = 0.005
+
+
+def frame_of(axes=(0.5, 0.3, 0.8), end_s=60.0):
+    """Turning to and fro about three axes at different rates."""
+    edges = np.arange(0.0, end_s + DT / 2, DT)
+    middle = edges[:-1] + DT / 2
+    rate = np.stack([a * np.cos(w * middle) for a, w in zip(axes, (1.1, 0.7, 0.4), strict=True)], axis=1)
+    none = np.zeros(len(middle))
+    steps = Steps(0, edges, rate, np.zeros_like(rate), none, none, DT, ())
+    return gyro_frame(steps, rate, np.zeros(3))
+
+
+def poses_of(frame, R_bl, late_s, seed=0, told=True):
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.5, frame.steps.edges_s[-1] - 0.5, 0.1)
+    R = frame.at(t) @ R_bl @ exp_so3(SIGMA * rng.standard_normal((len(t), 3)))
+    root = np.diag([1 / SIGMA] * 3 + [1e3] * 3) * told
+    values = np.hstack([R.reshape(-1, 9), np.zeros((len(t), 3)), np.tile(root.ravel(), (len(t), 1))])
+    return Samples("lidar", t + late_s, values)
+
+
+def lidar(rpy_deg=(0.0, 0.0, 0.0)) -> Lidar:
+    return Lidar(topic="/points", T_bl={"rpy_deg": list(rpy_deg)})
+
+
+@pytest.mark.parametrize(
+    ("rpy_deg", "late_s"), [((0, 0, 0), 0.0), ((2, -1, 5), 0.04), ((180, 0, 0), -0.03), ((0, 0, 90), 0.1)]
+)
+def test_clock_and_mounting_are_found(rpy_deg, late_s):
+    frame, R_bl = frame_of(), rotation_from_rpy(np.deg2rad(np.array(rpy_deg, float)))
+    errors = []
+    for seed in range(12):
+        found = against_gyro(lidar(), poses_of(frame, R_bl, late_s, seed), frame)
+        turn = log_so3(exp_so3(found.turn).T @ R_bl)
+        errors.append(np.append(turn / found.turn_sd, (found.late_s - late_s) / found.late_sd))
+        assert np.abs(turn).max() < np.deg2rad(0.3)
+        assert abs(found.late_s - late_s) < 3e-3
+    # 48 squares, 1 expected of each: chi-square of 48 in 1 of 10^4 cases beyond 93; sds may be large, never small
+    assert np.sum(np.square(errors)) < 93.0
+
+
+def test_what_contradicts_the_rig_is_said():
+    frame = frame_of()
+    right = rotation_from_rpy(np.deg2rad([0.5, -1.0, 1.5]))
+    sensor = lidar((0.5, -1.0, 1.5))
+    assert contradictions("lidar", sensor, against_gyro(sensor, poses_of(frame, right, 0.0), frame)) == []
+    clock, mounting = contradictions(
+        "lidar", lidar((0.5, -1.0, 41.5)), against_gyro(lidar((0.5, -1.0, 41.5)), poses_of(frame, right, 0.08), frame)
+    )
+    assert "clock_offset_s=0.08" in clock
+    assert "40.0 deg" in mounting
+    assert "rpy_deg=[0.5, -1.0, 1.5]" in mounting
+
+
+def test_turns_about_one_axis_leave_the_mounting_about_it_open():
+    frame = frame_of(axes=(0.0, 0.0, 0.8))
+    found = against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0), frame)
+    assert found.turn_sd[2] > 1.0
+    assert found.turn_sd[:2].max() < np.deg2rad(0.3)
+    assert contradictions("lidar", lidar(), found) == []
+
+
+def test_nothing_told_is_nothing_found():
+    frame = frame_of()
+    assert against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0, told=False), frame) is None
+    assert against_gyro(lidar(), poses_of(frame_of(end_s=4.0), np.eye(3), 0.0), frame) is None
