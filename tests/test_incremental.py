@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -55,6 +57,8 @@ def test_newest_estimate_is_that_of_the_whole_past(problem, smoothed):
 
 
 def test_window_longer_than_the_log_is_isam2(problem):
+    # without losses, whose weights the window iterates and iSAM2 takes as they come
+    problem = replace(problem, rows=[replace(rows, loss="none") for rows in problem.rows])
     moving, whole = window.run(problem, 1000.0), incremental.run(problem)
     assert_allclose(moving.causal_x, whole.causal_x, atol=1e-3)
 

@@ -21,6 +21,7 @@ from tbmfg.state import BA, NAV, POS, ROT, VEL
 from tbmfg.timeseries import Floats
 
 BIAS = slice(BA.start, NAV)
+FREE_M = 1e3  # sd of a position that a factor of a whole pose is not meant to hold
 # which parts of the keyframes i and j a model depends on, in the order of its factor's keys
 PARTS = {
     "odometer": ("XB", "X"),
@@ -30,7 +31,6 @@ PARTS = {
     "position": ("X", ""),
     "bounded": ("XV", ""),
     "lidar": ("XV", "XV"),
-    "rotation": ("X", "X"),
 }
 SYMBOLS = {"X": X, "V": V, "B": B, "D": D}
 BLOCKS = {"X": slice(0, 6), "V": VEL, "B": BIAS, "D": slice(NAV, None)}
@@ -131,6 +131,9 @@ class Factors:
         k, key = int(rows.j[r]), self.constant_key(sensor)
         if rows.model == "velocity":
             return gtsam.PriorFactorVector(V(k), rows.z[r], robust(rows.sigma[r], rows.loss))
+        if rows.model == "rotation":
+            noise = robust(np.append(rows.sigma[r], np.full(3, FREE_M)), rows.loss)
+            return gtsam.BetweenFactorPose3(X(int(rows.i[r])), X(k), gtsam.Pose3(), noise)
         if rows.model == "prism":
             noise, z = robust(rows.sigma[r], rows.loss), self._at_keyframe(rows, r, x)
             if key is None:
