@@ -186,6 +186,10 @@ def magnetometer(
         direction = rng.standard_normal(3)
         drawn["residual_ut"] = residual_ut * direction / np.linalg.norm(direction)
         measured += 1e-6 * drawn["residual_ut"]
+    if sensor.hard_iron_sd_ut:
+        iron_ut = sensor.hard_iron_sd_ut * rng.standard_normal(3)
+        drawn["hard_iron_ut"] = np.array(sensor.hard_iron_ut) + iron_ut
+        measured += 1e-6 * iron_ut
     if disturb is not None:
         added_n, told = disturb(t_ns * 1e-9, motion.R, field_n)
         measured += rotate_back(motion.R, added_n) @ sensor.R_bm
@@ -214,7 +218,7 @@ def barometer(
     depth = -scene.motion(t_ns * 1e-9).position[:, 2]
     warmth, weather, trend = rng.standard_normal(3)
     white, steps = rng.standard_normal((len(t_ns), 2)).T
-    air_k = AIR_K / (1.0 + (sensor.scale_sd or 0.0) * warmth)
+    air_k = AIR_K / (1.0 + sensor.scale_sd * warmth)
     middle_m = (depth.min() + depth.max()) / 2
     gravity = -scene.gravity_n[2]
     per_metre = 101325.0 * gravity / (AIR_GAS * AIR_K)
@@ -270,7 +274,7 @@ def laser(
     """
     t_ns = ticks(scene.duration_s, rate_hz)
     truth = scene.motion(t_ns * 1e-9)
-    tilt, zero = np.array([[sensor.tilt_sd or 0.0], [sensor.offset_sd or 0.0]]) * rng.standard_normal((2, 2))
+    tilt, zero = np.array([[sensor.tilt_sd], [sensor.offset_sd]]) * rng.standard_normal((2, 2))
     *white, dust = rng.standard_normal((len(t_ns), 3)).T
     spot = spot_on_detector(truth, np.array(sensor.T_bd.xyz_m), sensor.T_bd.R, np.append(tilt, 1.0))
     noisy = spot + zero + 1e-3 * sensor.sigma_mm * np.column_stack(white)

@@ -8,6 +8,7 @@ import numpy as np
 
 from tbmfg.earth import north_direction
 from tbmfg.errors import RigError
+from tbmfg.fields import MICRO_TESLA
 from tbmfg.geometry import exp_so3, rotation_from_rpy
 from tbmfg.inertial.steps import GAP, Steps, step_index
 from tbmfg.inertial.strapdown import rotations
@@ -174,18 +175,20 @@ def periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
 def magnetometer_rows(
     sensor: Magnetometer, fields: Samples, keyframes_s: Floats, frame: GyroFrame, x_axis_azimuth: float, calib: slice
 ) -> Rows:
-    """Fields averaged to the nearest keyframe, carried there by the gyro."""
+    """Fields averaged to the nearest keyframe, carried there by the gyro, and with them the sensor's axes."""
     t = fields.t_s - sensor.clock_offset
-    b = (fields.values - sensor.hard_iron) @ sensor.R_bm.T
     k = nearest(keyframes_s, t)
-    carried = np.einsum("nij,nj->ni", frame.at(t), b)
-    used, mean, count = _group(k, carried)
-    z = np.einsum("nji,nj->ni", frame.at(keyframes_s[used]), mean)
-    north = np.full((len(used), 1), north_direction(x_axis_azimuth))
+    axes = frame.at(t) @ sensor.R_bm
+    carried = np.einsum("nij,nj->ni", axes, fields.values - sensor.hard_iron)
+    used, mean, count = _group(k, np.column_stack([carried, axes.reshape(-1, 9)]))
+    R_k = frame.at(keyframes_s[used]).transpose(0, 2, 1)
+    z = np.einsum("nij,nj->ni", R_k, mean[:, :3])
+    own = MICRO_TESLA * (R_k @ mean[:, 3:].reshape(-1, 3, 3)).reshape(-1, 9)
+    data = np.column_stack([np.full(len(used), north_direction(x_axis_azimuth)), own])
     # samples average their noise away, but not the disturbance that they share
     lasting = sensor.disturbance**2 * _dependence(keyframes_s, sensor.disturbance_time)[used]
     sigma = np.sqrt(sensor.sigma**2 / count + lasting)[:, None]
-    return Rows(fields.sensor, "magnetometer", used, used, z, north, sigma, calib, count, sensor.loss)
+    return Rows(fields.sensor, "magnetometer", used, used, z, data, sigma, calib, count, sensor.loss)
 
 
 def laser_rows(

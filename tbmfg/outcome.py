@@ -123,6 +123,10 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             found[f"{sensor}_mounting_yaw_pitch_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
         elif what == "declination":
             found[f"{sensor}_declination_deg"] = Calibrated(np.rad2deg(c[k]), np.rad2deg(sd[k]), estimated)
+        elif what == "iron_x":
+            three = slice(k, k + 3)
+            value = problem.rig.sensors[sensor].hard_iron_ut + c[three]
+            found[f"{sensor}_hard_iron_ut"] = Calibrated(tuple(value), tuple(sd[three]), estimated)
         elif what == "mount_x":
             three, turn = slice(k, k + 3), slice(k + 3, k + 6)
             found[f"{sensor}_mounting_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)

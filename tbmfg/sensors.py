@@ -172,20 +172,24 @@ def wheel(z, data, xi, xj, c):
 def magnetometer(z, data, xi, xj, c):
     """Direction of the horizontal magnetic field, an angle in n: steel bends the vertical component most.
 
-    z (3): field in b, any unit. data (1): angle of magnetic north in n [rad]. c (1): error of the declination, east
-    positive [rad]. The full vector is rotated by the estimated attitude, so that a tilt error couples
-    in with tan(dip): shearer (23), erratum H9.
+    z (3): field in b [T]. data (10): angle of magnetic north in n [rad], then C (9, row by row), which takes the
+    machine's own field from the sensor's axes, microtesla, to what it adds to z. c (4): error of the declination, east
+    positive [rad], and what of the own field is not yet subtracted [microtesla]. The full vector is rotated by the
+    estimated attitude, so that a tilt error couples in with tan(dip): shearer (23), erratum H9.
     """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.ones((n, 1, 1))
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.ones((n, 1, 4))
     for k in range(n):
-        x, m = xi[k], z[k]
+        x, C = xi[k], data[k, 1:].copy().reshape(3, 3)
+        m = z[k] - C @ c[1:]
         h = _rotate(x, m)
         turn = np.zeros((3, 3))
         _add_minus_R_skew(turn, x, m, 1.0)
         square = h[0] * h[0] + h[1] * h[1]
         for b in range(3):
             Ji[k, 0, b] = (h[0] * turn[1, b] - h[1] * turn[0, b]) / square
+            own = _rotate(x, C[:, b])
+            Jc[k, 0, 1 + b] = (h[1] * own[0] - h[0] * own[1]) / square
         angle = np.arctan2(h[1], h[0]) - data[k, 0] + c[0]
         r[k, 0] = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
     return r, Ji, np.zeros((n, 1, 0)), Jc

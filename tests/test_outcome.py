@@ -139,7 +139,8 @@ def test_calibrations_have_their_names_and_units():
     found = result.calibration
     assert set(found) == {
         "prism_lever_arm_m", "prism_clock_offset_s", "odometer_scale", "odometer_mounting_yaw_pitch_deg",
-        "magnetometer_declination_deg", "noise_factor", "noise_factor_gyro", "noise_factor_acc",
+        "magnetometer_declination_deg", "magnetometer_hard_iron_ut",
+        "noise_factor", "noise_factor_gyro", "noise_factor_acc",
     }  # fmt: skip
     estimated = {name for name, value in found.items() if value.estimated}
     assert estimated == {
@@ -175,6 +176,16 @@ def test_calibrations_in_degrees():
     c[k], sd[k] = 0.1, 0.02
     declination = calibrations(problem, c, sd)["magnetometer_declination_deg"]
     assert (declination.value, declination.sd) == pytest.approx((np.degrees(0.1), np.degrees(0.02)))
+
+
+def test_hard_iron_is_the_whole_one_in_microtesla():
+    known = ("sensors.magnetometer.hard_iron_ut=[5,-3,8]", "sensors.magnetometer.hard_iron_sd_ut=2")
+    problem = flight_problem(0, 8.0, known)
+    first, last = (problem.parameters.names.index(f"magnetometer.iron_{axis}") for axis in "xz")
+    c, sd = problem.parameters.mean.copy(), problem.parameters.sd.copy()
+    c[first], sd[last] = 0.5, 0.1
+    iron = calibrations(problem, c, sd)["magnetometer_hard_iron_ut"]
+    assert (iron.value, iron.sd) == ((5.5, -3.0, 8.0), (2.0, 2.0, 0.1))
 
 
 def test_what_the_log_did_not_say_is_said():

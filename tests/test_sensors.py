@@ -37,7 +37,7 @@ CASES = {
     ),
     "wheel": ([1.3], [-0.4, 0.3, -1.1, 0.7, -1.1, 0.9, 1.1], [0.07, 0.21, -0.13], 10.0),
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
-    "magnetometer": ([14.0, -17.0, -31.0], [0.4], [0.05], 20.0),
+    "magnetometer": ([14.0, -17.0, -31.0], [0.4, *(1.3 * R_BD).ravel()], [0.05, 0.8, -0.5, 1.1], 20.0),
     "barometer": ([11.2], [0.04, 1.0, 3.0], [0.02], 20.0),
     "position": ([39.0, -69.0, 11.0], [], [], 80.0),
     # tilted by some 20 degrees, 15 m above z = 0: third derivatives grow as the distance over cos^4
@@ -55,7 +55,7 @@ CALIBRATIONS = {
     "prism": ["arm.x", "arm.y", "arm.z", "offset"],
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
-    "magnetometer": ["declination"],
+    "magnetometer": ["declination", "iron.x", "iron.y", "iron.z"],
     "barometer": ["scale"],
     "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
@@ -244,9 +244,10 @@ def test_magnetometer_at_truth_and_across_the_branch_cut():
     direction = north - declination
     field_n = np.array([np.cos(dip) * np.cos(direction), np.cos(dip) * np.sin(direction), -np.sin(dip)])
     for turn in (0.0, 0.2, 1.0, -3.0):  # direction + turn passes +-pi
-        field_b = R.T @ exp_so3(np.array([0.0, 0.0, turn])) @ field_n * 48e-6
-        data = np.array([[north]])
-        residual, *_ = sensors.magnetometer(field_b[None], data, X_I[None], X_I[None], np.array([declination]))
+        iron_ut = np.array([3.0, -8.0, 5.0])
+        field_b = R.T @ exp_so3(np.array([0.0, 0.0, turn])) @ field_n * 48e-6 + R_BD @ iron_ut * 1e-6
+        data, c = np.array([[north, *(1e-6 * R_BD).ravel()]]), np.array([declination, *iron_ut])
+        residual, *_ = sensors.magnetometer(field_b[None], data, X_I[None], X_I[None], c)
         assert residual[0, 0] == pytest.approx(turn, abs=1e-14)
 
 

@@ -188,6 +188,7 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
             entries += [(f"{name}.{axis}", getattr(sensor, axis), sensor.mounting_sd) for axis in ("yaw", "pitch")]
         elif isinstance(sensor, Magnetometer):
             entries += [(f"{name}.declination", sensor.declination, sensor.declination_sd)]
+            entries += [(f"{name}.iron_{axis}", 0.0, sensor.hard_iron_sd_ut) for axis in "xyz"]
         elif isinstance(sensor, Lidar):
             entries += [(f"{name}.mount_{axis}", sensor.T_bl.xyz[k], sensor.xyz_sd) for k, axis in enumerate("xyz")]
             entries += [(f"{name}.turn_{axis}", 0.0, sensor.rpy_sd) for axis in "xyz"]
