@@ -13,6 +13,7 @@ from tbmfg.registry import Registry
 from tbmfg.rig import Rig, kind_of, switches
 
 if TYPE_CHECKING:
+    from tbmfg.filters import tbm
     from tbmfg.problem import Problem
     from tbmfg.smoother.online import Online
     from tbmfg.state import Result
@@ -147,6 +148,10 @@ def _sbm(name: str, summary: str) -> Estimator:
 
 def tbm_ins_ts(problem: Problem, progress: Progress) -> Result:
     """The coupled filter of inertial unit and total station of Liu, Wang & Tao."""
+    return _ins_ts(problem, progress)[0]
+
+
+def _ins_ts(problem: Problem, progress: Progress) -> tuple[Result, tbm.Filtered]:
     from tbmfg.filters import tbm
     from tbmfg.inertial.steps import to_ns
     from tbmfg.outcome import result
@@ -156,13 +161,48 @@ def tbm_ins_ts(problem: Problem, progress: Progress) -> Result:
     seen = tbm.view(problem, options)
     f = tbm.run(seen, options, progress)
     edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
-    return result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
+    return result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns), f
+
+
+def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
+    """The states of ``tbm-ins-ts`` and LiDAR odometry in a factor graph."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from tbmfg.outcome import beyond_gate, result, ungated
+    from tbmfg.smoother import rrr
+
+    name = "tbm-rrr-mf"
+    options = switches(problem.rig, name, rrr.RrrMf)
+    ins_ts, f = _ins_ts(problem, progress)
+    steps = [rrr.trusted(rows, options) for rows in problem.rows if rows.model == "lidar"]
+    c = problem.parameters.start
+    fused = rrr.solve(f.x, f.cov, steps, c)
+    seen = replace(problem, rows=steps, drift_names=(), drift_walk=np.zeros(0))
+    gated = {sensor: np.zeros(len(nis), dtype=bool) for sensor, nis in fused.nis.items()}
+    out = result(seen, name, fused.x, fused.cov, c, np.zeros((len(c), len(c))), fused.nis, gated)
+    for prism in ins_ts.innovations:
+        out.innovations[prism], out.counts[prism] = ins_ts.innovations[prism], ins_ts.counts[prism]
+    out.calibration = ins_ts.calibration
+    out.warnings += [
+        *ungated(beyond_gate(seen, fused.nis)),
+        f"{name} takes every state of tbm-ins-ts for an independent prior, though they share their fixes: its "
+        "covariance is too small",
+    ]
+    return out
 
 
 def _tbm_switches() -> type[Node]:
     from tbmfg.filters.tbm import InsTs
 
     return InsTs
+
+
+def _rrr_switches() -> type[Node]:
+    from tbmfg.smoother.rrr import RrrMf
+
+    return RrrMf
 
 
 OWN: dict[str, Estimator] = {
@@ -210,6 +250,13 @@ OWN: dict[str, Estimator] = {
         ("imu", "prism"),
         "Liu, Wang & Tao (TBM-MSE)",
         _tbm_switches,
+    ),
+    "tbm-rrr-mf": Estimator(
+        tbm_rrr_mf,
+        "the states of tbm-ins-ts and LiDAR odometry of a fixed covariance in a factor graph",
+        ("imu", "prism", "lidar"),
+        "Liu, Wang & Tao (TBM-MSE), as a comparison",
+        _rrr_switches,
     ),
     "sbm-cf": _sbm("sbm-cf", "complementary filter: gyro with accelerometer and magnetometer, observers for the rest"),
     "sbm-ekf": _sbm("sbm-ekf", "extended Kalman filter in Euler angles, with laser spot and barometer"),

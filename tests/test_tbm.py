@@ -13,9 +13,13 @@ from tbmfg.estimators import estimate, unmet
 from tbmfg.evaluation.metrics import nees
 from tbmfg.filters import tbm
 from tbmfg.filters.tbm import InsTs, Prediction
+from tbmfg.measure import Samples
 from tbmfg.prepare import prepare
+from tbmfg.problem import Parameters
 from tbmfg.rig import override
-from tbmfg.state import BG
+from tbmfg.sensors import Rows
+from tbmfg.smoother import rrr
+from tbmfg.state import BG, Counts
 from tests.problems import clean_log, drive, log_of, state_errors, true_rig, true_states
 
 ALONE = ("odometer", "magnetometer")
@@ -106,6 +110,68 @@ def test_gauss_markov_biases_fade_and_their_variance_stays():
     assert_allclose(moved[18:21], 1e-6 * np.exp(-elapsed / 10.0), rtol=1e-9)
     # in pieces of 0.1 s: noise acts inside a piece and fades from its end
     assert_allclose(np.diag(P)[BG], own.rig.imu.gyro_bias_sd**2, rtol=0.011)
+
+
+# ---- with LiDAR odometry ----
+
+
+def odometry(truth, sigma_m=0.01):
+    """Perfect steps from keyframe to keyframe, as rows of a LiDAR that lies in b."""
+    R, p, n = truth[:, :9].reshape(-1, 3, 3), truth[:, 9:12], len(truth) - 1
+    back = R[:-1].swapaxes(1, 2)
+    z = np.hstack([(back @ R[1:]).reshape(n, 9), (back @ (p[1:] - p[:-1])[:, :, None])[:, :, 0]])
+    still = np.concatenate([np.zeros(4), np.eye(3).ravel()])
+    data = np.tile(np.concatenate([still, still, np.eye(3).ravel(), np.eye(6).ravel()]), (n, 1))
+    i = np.arange(n)
+    rows = Rows("lidar", "lidar", i, i + 1, z, data, np.ones((n, 6)), slice(0, 6), np.ones(n, dtype=int))
+    return rrr.trusted(rows, rrr.RrrMf(sigma_m=sigma_m, sigma_deg=0.01))
+
+
+def test_without_steps_the_graph_is_the_filter():
+    filtered = run(problem())
+    alone = rrr.solve(filtered.x, filtered.cov, [], np.zeros(6))
+    assert_allclose(alone.x, filtered.x, atol=1e-12)
+    sd = np.sqrt(np.diagonal(filtered.cov, axis1=1, axis2=2))
+    assert np.abs((alone.cov - filtered.cov) / sd[:, :, None] / sd[:, None]).max() < 1e-9
+
+
+def test_perfect_steps_smooth_the_filter():
+    filtered, truth = run(problem()), true_states(drive(0, 30.0, imu_rate_hz=100.0), problem())
+    fused = rrr.solve(filtered.x, filtered.cov, [odometry(truth, 1e-4)], np.zeros(6))
+    off = [np.diff(state_errors(x, truth)[:, 3:6], axis=0) for x in (filtered.x, fused.x)]
+    assert np.std(off[1]) < 0.1 * np.std(off[0])
+    assert fused.nis["lidar"].mean() < 6
+    assert np.all(
+        np.trace(fused.cov[:, 3:6, 3:6], axis1=1, axis2=2) < np.trace(filtered.cov[:, 3:6, 3:6], axis1=1, axis2=2)
+    )
+
+
+def test_it_believes_whatever_the_odometry_says():
+    """No robust loss: steps that are 20 cm wrong at 1 cm move the whole, and it is said."""
+    own = problem()
+    truth = true_states(drive(0, 30.0, imu_rate_hz=100.0), own)
+    steps = odometry(truth)
+    steps.z[60:80, 9] += 0.2
+    names = own.parameters.names + tuple(f"lidar.mount_{a}" for a in "xyz") + tuple(f"lidar.turn_{a}" for a in "xyz")
+    zero = np.zeros(6)
+    parameters = Parameters(names, *(np.r_[part, zero] for part in (own.parameters.mean, own.parameters.sd)),
+                            np.r_[own.parameters.start, zero])  # fmt: skip
+    steps = replace(steps, calib=slice(len(names) - 6, len(names)))
+    counts = {**own.counts, "lidar": Counts(received=len(steps))}
+    wrong = replace(
+        own, rows=[*own.rows, steps], parameters=parameters, counts=counts,
+        samples={**own.samples, "lidar": Samples("lidar", own.keyframes_s[1:], steps.z)},
+    )  # fmt: skip
+    found = estimate("tbm-rrr-mf", wrong)
+    assert found.counts["lidar"].used == len(steps)
+    assert found.counts["prism"].parts() == found.counts["prism"].received
+    assert any("lidar: " in line and "contradict" in line for line in found.warnings)
+    assert any("covariance is too small" in line for line in found.warnings)
+    assert np.abs(state_errors_of(found, truth, own)).max() > 0.02
+
+
+def state_errors_of(found, truth, problem):
+    return found.trajectory.position_n - problem.origin_n - truth[:, 9:12]
 
 
 # ---- what is wrong ----

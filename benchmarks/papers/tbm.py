@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from tbmfg.timeseries import Floats
 
 INS_TS = "tbm-ins-ts"
-METHODS = tuple(Method(name, name) for name in (INS_TS, "ins", "fixed-lag", "batch"))
+METHODS = tuple(Method(name, name) for name in (INS_TS, "tbm-rrr-mf", "ins", "fixed-lag", "batch"))
 DUST = (0.05, 0.2, 0.5)  # 1/m
 LIMIT_M = 0.3
 
