@@ -214,9 +214,9 @@ def test_the_mean_rate_of_a_coning_body_is_that_of_its_rotation():
     omega = 2 * np.pi * 24.5
     gyro = 1e-5 + size * np.stack([np.cos(omega * t), np.sin(omega * t), np.zeros(len(t))], axis=1)
     steps = make_steps(imu_series(gyro, np.zeros((len(t), 3)), period_ns=round(1e9 / 475)), np.eye(3), "end")
-    rows = slice(0, round(245 * 475 / 24.5))  # whole turns
+    rows = slice(0, round(240.3 * 475 / 24.5))  # not whole turns
     # the cone's own rate, size^2 / (2 omega), is what a body needs to come back to where it was
     coning = size**2 / (2 * omega)
     assert coning > 2e-7
-    assert_allclose(gyro[rows].mean(axis=0), 1e-5, atol=1e-12)
+    assert np.abs(gyro[rows].mean(axis=0) - 1e-5).max() > 20 * coning
     assert_allclose(alignment.mean_rate(steps, rows), [1e-5, 1e-5, 1e-5 + coning], atol=0.02 * coning)

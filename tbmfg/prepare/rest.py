@@ -35,6 +35,15 @@ def find(rig: Rig, samples: dict[str, Samples], steps: Steps, still: list[tuple[
     return Rest(confirmed, *(_vibration(steps, signal, confirmed) for signal in (steps.acc, steps.gyro)))
 
 
+def sure(
+    rig: Rig, samples: dict[str, Samples], steps: Steps, still: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Stretches in which a machine may be taken to feel the Earth's rate alone: confirmed rest, or all ``still`` ones
+    where no sensor could confirm it. On an uneven floor slow driving looks still and turns a hundred times faster."""
+    able = any(isinstance(rig.sensors[name], PositionSensor | Odometer) for name in samples)
+    return _confirmed(rig, samples, _unturning(steps, still)) if able else still
+
+
 def _unturning(steps: Steps, still: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Stretches without those of a steady turn: their mean rate is not what the gyro shows in most of the others."""
     if not still:

@@ -71,8 +71,8 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
         warnings += _against_magnetometer(rig, samples, frame, R_start)
     elif (magnetic := _magnetic_heading(rig, samples, frame, R_level)) is not None:
         R_start, yaw_sd = rotation_z(magnetic[0]) @ R_level, min(yaw_sd, np.deg2rad(10.0))
-    elif still and bound < GYROCOMPASS:
-        turn = alignment.gyrocompass(steps, R_0t, still, R_level, rig.origin.rate_n)
+    elif bound < GYROCOMPASS and (resting := rest.sure(rig, samples, steps, still)):
+        turn = alignment.gyrocompass(steps, R_0t, resting, R_level, rig.origin.rate_n)
         R_start, yaw_sd, gyrocompassed = rotation_z(turn) @ R_level, bound, True
         warnings.append(
             f"heading by gyrocompass: at first no better than bias / (w cos lat) = {np.rad2deg(bound):.2g} deg (1 sd)"
