@@ -271,10 +271,10 @@ def test_without_a_loss_outliers_pull():
     problem = flight_problem(2, 12.0)
     prism = rows_of(problem, "prism")
     z = prism.z.copy()
-    z[50] += [0.0, 3.0, 0.0]
+    z[50] += [0.0, 0.5, 0.0]
     spoilt = with_rows(problem, "prism", replace(prism, z=z, loss="none"))
     moved = solved(spoilt).x[prism.j[50], 9:12] - solved(problem).x[prism.j[50], 9:12]
-    assert moved[1] > 0.1
+    assert moved[1] > 0.05, "of half a metre; the neighbours and the IMU hold against it"
 
 
 def test_what_is_not_determined_is_named_with_its_times_and_the_next_move():
