@@ -129,7 +129,7 @@ def test_a_tunnel_tells_all_but_the_way_along_it():
     R, p = exp_so3(np.array([0.01, -0.02, 0.015])), np.array([0.3, 0.04, -0.05])
     scan = (tube(rng, 3000, 0.02) - p) @ R
     prior = (np.eye(3), np.array([0.2, 0.0, 0.0]))
-    found = registration.align(scan, prior, prior, planes)
+    found = registration.align(scan, prior, prior, planes, 1.0)
     assert found.weak.shape[1] == 1
     assert abs(found.weak[3, 0]) > 0.9 * np.linalg.norm(found.weak[3:, 0])
     assert found.p[0] == pytest.approx(0.2, abs=0.02)  # stays at the prior, 0.1 m from the truth
@@ -139,6 +139,19 @@ def test_a_tunnel_tells_all_but_the_way_along_it():
     assert found.overlap > 0.95
     S = whitening(found.information, 1.0)
     assert np.linalg.svd(S)[1][-1] < 1e-12 * np.linalg.svd(S)[1][0]
+
+
+def test_what_a_tunnel_hides_is_not_told_by_many_scans_either():
+    """Each scan takes the tunnel's axis from its own noisy normals: no two agree but in that nothing moves."""
+    rng = np.random.default_rng(14)
+    odometry, told, step, scans = Odometry(SENSOR, Blind()), 0.0, 0.05, 25
+    for k in range(scans):
+        points = tube(rng, 20_000, 0.02) - [step * k, 0.0, 0.0]
+        pose = odometry.register(clouds.Scan(0, points[np.abs(points[:, 0]) < 15.0], None, 0, 0, 0), 0.1 * k)
+        assert pose.weak == (1 if k else 6)
+        told += np.sum((pose.root @ np.concatenate([np.zeros(3), pose.R.T @ [step, 0.0, 0.0]])) ** 2)
+    # squared sds by which all together contradict the true way: no slide is told better than it is predicted
+    assert told < 2 * scans * (step / Blind().slide(0.0, 0.1)) ** 2
 
 
 def test_an_end_wall_tells_the_way_along():
@@ -158,7 +171,7 @@ def test_an_end_wall_tells_the_way_along():
     planes = SurfelMap(0.5)
     planes.add(closed(60_000))
     prior = (np.eye(3), np.zeros(3))
-    found = registration.align(closed(3000) - [0.1, 0.0, 0.0], prior, prior, planes)
+    found = registration.align(closed(3000) - [0.1, 0.0, 0.0], prior, prior, planes, 1.0)
     assert found.weak.shape[1] == 0
     assert_allclose(found.p, [0.1, 0.0, 0.0], atol=5e-3)
 

@@ -16,6 +16,7 @@ from tbmfg import mapping
 from tbmfg.errors import TbmfgError
 from tbmfg.lidar import raster
 from tbmfg.mcap import read_log
+from tbmfg.pipeline import run
 from tbmfg.rig import load_rig
 from tbmfg.state import Trajectory
 
@@ -54,6 +55,16 @@ def test_map_along_the_truth(made, tmp_path):
     assert picture.startswith(b"\x89PNG")
     with pytest.raises(TbmfgError, match="--force"):
         mapping.make(str(log), folder, tmp_path / "map.ply")
+
+
+def test_map_along_the_estimate_is_as_sharp(made, tmp_path):
+    log, folder = made
+    run(str(log), estimator="batch", output=tmp_path / "batch")
+    thick = [
+        mapping.make(str(log), along, tmp_path / f"{along.name}.ply")[0].thickness_m
+        for along in (folder, tmp_path / "batch")
+    ]
+    assert abs(thick[1] / thick[0] - 1.0) < 0.1
 
 
 def test_ghosts_show(made, tmp_path):

@@ -10,6 +10,8 @@ from numba import njit
 from tbmfg.geometry import exp_so3, log_so3
 from tbmfg.timeseries import Floats
 
+SLIP = 0.1  # share of a step by odometer that may be wrong
+FASTEST = 10.0  # m/s: what the speed may be that nothing tells
 NODE_S = 0.002  # between the poses that a scan is carried with
 
 
@@ -39,6 +41,13 @@ class Inertia:
             way = np.stack([np.interp(t_s, self.t_s, self.way_0[:, axis]) for axis in range(3)], axis=1)
         return R @ self.R_bl, way + R @ self.xyz
 
+    def slide(self, first_s: float, last_s: float) -> float:
+        """How far off a predicted step may be, m."""
+        if self.way_0 is None:
+            return FASTEST * (last_s - first_s)
+        ends = [[np.interp(t, self.t_s, self.way_0[:, axis]) for axis in range(3)] for t in (first_s, last_s)]
+        return SLIP * float(np.linalg.norm(np.subtract(*ends)))
+
 
 @dataclass(frozen=True, slots=True)
 class Blind:
@@ -48,6 +57,10 @@ class Blind:
         """As :meth:`Inertia.poses`; 0 is the LiDAR's frame at the first time."""
         after = (t_s - t_s[0])[:, None]
         return exp_so3(rate_l * after), velocity_0 * after
+
+    def slide(self, first_s: float, last_s: float) -> float:
+        """As :meth:`Inertia.slide`."""
+        return FASTEST * (last_s - first_s)
 
 
 def compensate(

@@ -110,10 +110,11 @@ class Odometry:
             R, p = (part[0] for part in self.motion.poses(np.array([t_s]), self.velocity_0, self.rate_l))
             return self._begin(t_s, R, p, points, dense, None)
         prior = self._predicted(t_s)
-        found = self._align(source, prior, prior)
+        slide_m = self.motion.slide(self.last.t_s, t_s)
+        found = self._align(source, prior, prior, slide_m)
         if self.usual.falls_short(found.overlap):
             self.sought += 1
-            found = max([found, *self._sought_anew(source, prior)], key=lambda one: one.support)
+            found = max([found, *self._sought_anew(source, prior, slide_m)], key=lambda one: one.support)
         deviation = np.linalg.inv(matrix(*prior)) @ matrix(found.R, found.p)
         self.kiss.adaptive_threshold.update_model_deviation(deviation)
         if found.overlap < FITS and self.unfit + 1 < LOST:
@@ -144,7 +145,9 @@ class Odometry:
         turn, shift = R[0].T @ R[1], R[0].T @ (p[1] - p[0])
         return self.last.R @ turn, self.last.p + self.last.R @ shift
 
-    def _align(self, source: Floats, guess: tuple[Floats, Floats], prior: tuple[Floats, Floats]) -> Aligned:
+    def _align(
+        self, source: Floats, guess: tuple[Floats, Floats], prior: tuple[Floats, Floats], slide_m: float
+    ) -> Aligned:
         """Onto the planes from KISS-ICP's pose, which is sought from ``guess``."""
         sigma = self.kiss.adaptive_threshold.get_threshold()
         T = self.kiss.registration.align_points_to_map(
@@ -154,13 +157,13 @@ class Odometry:
             max_correspondance_distance=3 * sigma,
             kernel=sigma,
         )
-        return registration.align(source, (T[:3, :3], T[:3, 3]), prior, self.planes)
+        return registration.align(source, (T[:3, :3], T[:3, 3]), prior, self.planes, slide_m)
 
-    def _sought_anew(self, source: Floats, prior: tuple[Floats, Floats]) -> Iterator[Aligned]:
+    def _sought_anew(self, source: Floats, prior: tuple[Floats, Floats], slide_m: float) -> Iterator[Aligned]:
         """From where it was, and from the prediction turned either way about the LiDAR's axis."""
         R, p = prior
         for guess in ((self.last.R, self.last.p), *((R @ rotation_z(turn), p) for turn in TURNS)):
-            yield self._align(source, guess, prior)
+            yield self._align(source, guess, prior, slide_m)
 
     def _begin(self, t_s: float, R: Floats, p: Floats, points: Floats, dense: Floats, found: Aligned | None) -> Pose:
         """A new map from one scan; ``found`` is how it lay on the old one."""

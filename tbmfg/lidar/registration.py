@@ -46,15 +46,19 @@ class Aligned:
     dust: float
 
 
-def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Floats], planes: SurfelMap) -> Aligned:
+def align(
+    points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Floats], planes: SurfelMap, slide_m: float
+) -> Aligned:
     """Gauss-Newton on the distances of ``points`` (n, 3) to ``planes``, from ``start``.
 
     In directions that the planes do not tell the pose is that of ``prior``: Zhang et al. (2016), with the test above.
+    ``slide_m`` is how far off it may be there. The direction itself is known only as well as the normals: an error e
+    of it turns a slide s into e s of what is told. With m planes, e' H e has the mean w' F w / m along w.
     """
     (R, p), sigma = start, SIGMA_M[1]
     table = planes.voxel, planes.keys, planes.surfels
     for iteration in range(ITERATIONS):
-        H, g, F, distance = linearise(points, R, p, *table, KERNEL * sigma)
+        H, g, F, distance, plane = linearise(points, R, p, *table, KERNEL * sigma)
         found = distance[np.isfinite(distance)]
         if len(found) < LEAST_NEAR:
             return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, 0.0, SIGMA_M[1], 1.0)
@@ -71,7 +75,8 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
         R, p = R @ exp_so3(step[:3]), p + R @ step[3:]
         if np.abs(step).max() < STILL:
             break
-    strength = np.where(weak, 0.0, ratio - 1.0) / sigma**2
+    slid = np.sum((slide_m / np.maximum(np.linalg.norm(V[3:, weak], axis=0), 1e-9)) ** 2)  # V' F V = 1
+    strength = np.where(weak, 0.0, ratio - 1.0) / (sigma**2 + slid / len(np.unique(plane[plane >= 0])))
     information = inverse.T @ (strength[:, None] * inverse)
     on = int(np.sum(np.abs(found) < ON * planes.voxel))
     ranges, alone = np.linalg.norm(points, axis=1), np.isnan(distance)
@@ -82,9 +87,10 @@ def align(points: Floats, start: tuple[Floats, Floats], prior: tuple[Floats, Flo
 @njit(cache=True)
 def linearise(points, R, p, voxel, keys, surfels, kernel):
     """Hessian H and gradient g of half the weighted squared distances, what noise of the normals adds to H on average
-    (F), and the distances (n,), NaN where there is no plane."""
+    (F), and the distances (n,) and rows of the planes (n,), NaN and -1 where there is none."""
     H, F, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
     distance = np.full(len(points), np.nan)
+    plane = np.full(len(points), -1)
     J = np.empty((3, 6))
     for n in range(len(points)):
         q = points[n]
@@ -96,7 +102,7 @@ def linearise(points, R, p, voxel, keys, surfels, kernel):
             continue
         s = surfels[row]
         r = s[3] * (x - s[0]) + s[4] * (y - s[1]) + s[5] * (z - s[2])
-        distance[n] = r
+        distance[n], plane[n] = r, row
         w = 1.0 / (1.0 + (r / kernel) ** 2) ** 2
         # the normal and the two directions into which it may tilt, each as a direction of measurement
         for d in range(3):
@@ -117,4 +123,4 @@ def linearise(points, R, p, voxel, keys, surfels, kernel):
     for a in range(6):
         for b in range(a):
             H[b, a], F[b, a] = H[a, b], F[a, b]
-    return H, g, F, distance
+    return H, g, F, distance, plane
