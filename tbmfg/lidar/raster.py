@@ -11,6 +11,7 @@ from tbmfg.timeseries import Floats
 
 WIDTH = 1600
 GAP = 20
+FAINTEST = 0.5  # shade of a single point: what was seen once is to be seen
 PATH = (230, 60, 40)
 
 
@@ -44,7 +45,7 @@ def _view(
     count = np.bincount(flat, minlength=height * WIDTH)
     mean = np.bincount(flat, shade[inside], height * WIDTH) / np.maximum(count, 1)
     dark = np.log1p(count) / np.log1p(max(np.percentile(count[count > 0], 99), 1))
-    dark = np.minimum(dark, 1.0)[:, None]
+    dark = np.where(count > 0, np.clip(dark, FAINTEST, 1.0), 0.0)[:, None]
     colour = np.stack([np.full_like(mean, 30.0), 60 + 140 * mean, 200 - 140 * mean], axis=1)
     image = (255 + dark * (colour - 255)).reshape(height, WIDTH, 3)
     steps = np.linspace(0, len(path) - 1, 20 * WIDTH)
