@@ -274,7 +274,8 @@ def test_without_a_loss_outliers_pull():
     z[50] += [0.0, 0.5, 0.0]
     spoilt = with_rows(problem, "prism", replace(prism, z=z, loss="none"))
     moved = solved(spoilt).x[prism.j[50], 9:12] - solved(problem).x[prism.j[50], 9:12]
-    assert moved[1] > 0.05, "of half a metre; the neighbours and the IMU hold against it"
+    # of half a metre; neighbours and IMU hold against it, and share it with the attitude. Under Huber it is 2 mm.
+    assert np.linalg.norm(moved) > 0.05
 
 
 def test_what_is_not_determined_is_named_with_its_times_and_the_next_move():
