@@ -81,13 +81,14 @@ def run(path: Path, problem: Problem, x: Floats) -> Solution:
             graph.add(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), pim))
     values.insert(L(0), sensor.arm)
 
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(np.sqrt(chi2.ppf(0.95, 3)))
+    estimator = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}[sensor.loss]
+    loss = estimator.Create(np.sqrt(chi2.ppf(0.95, 3)))
     prism_ns = prism_ns - round(sensor.clock_offset * NS)
     nearest = np.searchsorted((keyframes[1:] + keyframes[:-1]) // 2, prism_ns)
     for stamp, k, point in zip(prism_ns, nearest, prism, strict=True):
         if keyframes[0] <= stamp <= keyframes[-1]:
             noise = gtsam.noiseModel.Isotropic.Sigma(3, sensor.sigma_at(point))
-            robust = gtsam.noiseModel.Robust.Create(huber, noise)
+            robust = gtsam.noiseModel.Robust.Create(loss, noise)
             graph.add(gtsam.GPSFactorArmCalib(X(k), L(0), point - problem.origin_n, robust))
 
     prior, R = problem.prior, values.atPose3(X(0)).rotation().matrix()

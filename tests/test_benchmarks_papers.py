@@ -237,7 +237,8 @@ def test_the_pump_turns_the_heading_of_a_mean_and_not_of_a_rotation():
 
 def test_the_roadheaders_drives_are_measured():
     """On a drive without its LiDAR, which takes longer than all else."""
-    trial = Trial("dust", "tbm-drive", 0, 12.0, tbm.METHODS[:2], tbm.errors, options={"imu_rate_hz": 100.0})
+    methods = tuple(method for method in tbm.METHODS if method.estimator in ("tbm-ins-ts", "ins"))
+    trial = Trial("dust", "tbm-drive", 0, 12.0, methods, tbm.errors, options={"imu_rate_hz": 100.0})
     rows = {row.key: row for row in Outcomes(run(trial)).rows("dust", {}, {})}
     assert rows["dust", "tbm-ins-ts", "failed"].mean == 0
     assert 0 < rows["dust", "tbm-ins-ts", "position_rms"].mean < 0.1
