@@ -251,23 +251,25 @@ def laser(z, data, xi, xj, c):
 
 
 @njit(cache=True)
+def _direct(z, xi, state, error):
+    """Residual and Jacobians of z (k), the state's own numbers from ``state`` on, at ``error`` in the error state."""
+    n, k = z.shape
+    Ji = np.zeros((n, k, xi.shape[1] - 6))
+    for a in range(k):
+        Ji[:, a, error + a] = 1.0
+    return xi[:, state : state + k] - z, Ji, np.zeros((n, k, 0)), np.zeros((n, k, 0))
+
+
+@njit(cache=True)
 def position(z, data, xi, xj, c):
     """Position of b in n [m]: z (3), a surveyed point."""
-    n, d = len(z), xi.shape[1] - 6
-    Ji = np.zeros((n, 3, d))
-    for a in range(3):
-        Ji[:, a, 3 + a] = 1.0
-    return xi[:, 9:12] - z, Ji, np.zeros((n, 3, 0)), np.zeros((n, 3, 0))
+    return _direct(z, xi, 9, 3)
 
 
 @njit(cache=True)
 def velocity(z, data, xi, xj, c):
     """Velocity in n [m/s]: z (3); zero while the machine stands."""
-    n, d = len(z), xi.shape[1] - 6
-    Ji = np.zeros((n, 3, d))
-    for a in range(3):
-        Ji[:, a, 6 + a] = 1.0
-    return xi[:, 12:15] - z, Ji, np.zeros((n, 3, 0)), np.zeros((n, 3, 0))
+    return _direct(z, xi, 12, 6)
 
 
 def rotation(z, data, xi, xj, c):
@@ -284,11 +286,7 @@ def rotation(z, data, xi, xj, c):
 @njit(cache=True)
 def bounded(z, data, xi, xj, c):
     """A body that stays near a place: z (6): centre in n [m], then zero velocity [m/s]."""
-    n, d = len(z), xi.shape[1] - 6
-    Ji = np.zeros((n, 6, d))
-    for a in range(6):
-        Ji[:, a, 3 + a] = 1.0
-    return xi[:, 9:15] - z, Ji, np.zeros((n, 6, 0)), np.zeros((n, 6, 0))
+    return _direct(z, xi, 9, 3)
 
 
 def lidar(z, data, xi, xj, c):
