@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tbmfg import cli, pipeline
+from tbmfg.cli import options, terminal
 from tbmfg.errors import EstimationError, LogError, TbmfgError
 from tbmfg.rig import parse_rig
 from tbmfg.state import Calibrated, Counts, Result, Trajectory
@@ -216,8 +216,8 @@ def test_progress_is_drawn_on_a_terminal_only(toy, tmp_path, monkeypatch):
     ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path))
     assert toy.prepare[0]["progress"] is None
     assert ran.stderr == ""
-    monkeypatch.setattr(cli.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=len, flush=lambda: None))
-    with cli._progress_bar("reading") as progress:
+    monkeypatch.setattr(terminal.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=len, flush=lambda: None))
+    with terminal.progress_bar("reading") as progress:
         progress("solving", 0.5)
 
 
@@ -313,7 +313,7 @@ def test_missing_arguments_are_exit_code_2(arguments):
 
 
 def test_an_outage_names_sensor_and_seconds():
-    assert cli.parse_outage("prism-left:-1.5:2e1") == ("prism-left", -1.5, 20.0)
+    assert options.parse_outage("prism-left:-1.5:2e1") == ("prism-left", -1.5, 20.0)
 
 
 # ---- as a process ----
@@ -330,13 +330,13 @@ def test_help_answers_at_once():
     assert ran.stdout.strip() == "[]"
     taken = []
     for _ in range(3):
-        started = time.perf_counter()
+        before = os.times()
         ran = process("--help")
-        taken.append(time.perf_counter() - started)
+        after = os.times()
+        taken.append(after.children_user - before.children_user + after.children_system - before.children_system)
     assert ran.returncode == 0
     assert "run" in ran.stdout
-    # on a machine with more to do than processors the clock says nothing
-    assert min(taken) < 0.5 or os.getloadavg()[0] > os.cpu_count()
+    assert min(taken) < 0.5  # of the processor, which others may be busy with
 
 
 def test_version_and_exit_codes_of_the_process(tmp_path):
