@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from dataclasses import replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from datasets.recordings import Recording
     from datasets.simulate import Simulation
 
-# Each is a function ``make(rig, *, seed, duration, **options)`` whose default duration is the dataset's own length, in
-# a module that has ``rig()``, the rig whose priors it draws from.
+# Each is a function ``make(rig, *, seed, duration, ...)`` whose default duration is the dataset's own length, in a
+# module that has ``rig()``, the rig whose priors it draws from. Its other parameters are its options. Those that
+# several datasets share are the fields of a dataclass, and a parameter whose default is one stands for all of them.
 MACHINES = {
     "tbm-drive": "datasets.tbm:make",
     "tbm-static": "datasets.tbm_static:make",
@@ -87,7 +88,7 @@ def make(
         raise TbmfgError(f"{name}: a duration of {duration:g} s; it should be above 0")
     _refuse_unknown(name, options)
     machine = override(rig or _module(MACHINES[name]).rig(), settings)
-    return function(name)(machine, seed=seed, duration=duration, **options)
+    return function(name)(machine, seed=seed, duration=duration, **_grouped(name, options))
 
 
 def load(name: str, source: str | Path, *, settings: tuple[str, ...] = (), **options: Any) -> Recording:
@@ -95,7 +96,7 @@ def load(name: str, source: str | Path, *, settings: tuple[str, ...] = (), **opt
     if name not in RECORDINGS:
         raise TbmfgError(f"{name}: no such recording; there are {', '.join(RECORDINGS)}")
     _refuse_unknown(name, options)
-    recording = function(name)(source, **options)
+    recording = function(name)(source, **_grouped(name, options))
     return replace(recording, rig=override(recording.rig, settings))
 
 
@@ -107,6 +108,23 @@ def _refuse_unknown(name: str, options: dict[str, Any]) -> None:
 
 def defaults(name: str) -> dict[str, Any]:
     """The options of one dataset and their defaults."""
+    found: dict[str, Any] = {}
+    for key, value in _given(name).items():
+        found |= asdict(value) if is_dataclass(value) else {key: value}
+    return found
+
+
+def _grouped(name: str, options: dict[str, Any]) -> dict[str, Any]:
+    """``options`` as the function takes them: those of a dataclass as one."""
+    taken = dict(options)
+    for key, group in _given(name).items():
+        if is_dataclass(group):
+            taken[key] = replace(group, **{f.name: taken.pop(f.name) for f in fields(group) if f.name in taken})
+    return taken
+
+
+def _given(name: str) -> dict[str, Any]:
+    """The parameters that have a default, but for the duration."""
     given = {parameter.name: parameter.default for parameter in _parameters(name)}
     return {key: value for key, value in given.items() if value is not inspect.Parameter.empty and key != "duration"}
 

@@ -89,14 +89,15 @@ def sort(name: str, assignments: list[str]) -> tuple[tuple[str, ...], dict[str, 
             options[key] = _read(value, known.get(key, ""))
         except ValueError:
             what = "numbers" if isinstance(known[key], tuple) else "a number"
-            raise TbmfgError(f"--set {text}: {key} should be {what} such as {_written(known[key])}") from None
+            such = "" if known[key] is None else f" such as {_written(known[key])}"
+            raise TbmfgError(f"--set {text}: {key} should be {what}{such}") from None
     return settings, options
 
 
 def _read(text: str, default: Any) -> Any:
-    """``text`` as what ``default`` is: text, a number, or as many numbers between commas."""
+    """``text`` as what ``default`` is: text, a number (for none as well), or as many numbers between commas."""
     if not isinstance(default, tuple):
-        return type(default)(text)
+        return (float if default is None else type(default))(text)
     values = tuple(float(part) for part in text.split(","))
     if len(values) != len(default):
         raise ValueError

@@ -8,6 +8,8 @@ scale of depth. ``survey_sd_m`` above 0 puts a surveyed position at the log's en
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from datasets import shaft
@@ -30,30 +32,26 @@ def rig() -> Rig:
     return machine.model_copy(update={"sensors": kept, "name": "cage"})
 
 
-def fast(
-    machine: Rig,
-    *,
-    seed: int,
-    duration: float = FAST_S,
-    vibration: float = 1.0,
-    survey_sd_m: float = 0.0,
-    nominal: int = 0,
-) -> Simulation:
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How the rails shake, how well the log's end is surveyed (0: not), and ``nominal``: without shaking."""
+
+    vibration: float = 1.0
+    survey_sd_m: float = 0.0
+    nominal: int = 0
+
+
+SHAKEN = Way()
+
+
+def fast(machine: Rig, *, seed: int, duration: float = FAST_S, way: Way = SHAKEN) -> Simulation:
     """A cage going down 430 m at 3.90 m/s."""
-    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, vibration, survey_sd_m, nominal)
+    return ride("cage-fast", FAST_MPS, FAST_S, machine, seed, duration, way)
 
 
-def slow(
-    machine: Rig,
-    *,
-    seed: int,
-    duration: float = SLOW_S,
-    vibration: float = 1.0,
-    survey_sd_m: float = 0.0,
-    nominal: int = 0,
-) -> Simulation:
+def slow(machine: Rig, *, seed: int, duration: float = SLOW_S, way: Way = SHAKEN) -> Simulation:
     """A cage going down 419 m at 1.33 m/s."""
-    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, vibration, survey_sd_m, nominal)
+    return ride("cage-slow", SLOW_MPS, SLOW_S, machine, seed, duration, way)
 
 
 def ride(
@@ -63,20 +61,19 @@ def ride(
     machine: Rig,
     seed: int,
     duration: float,
-    vibration: float,
-    survey_sd_m: float,
-    nominal: int,
+    way: Way,
 ) -> Simulation:
     """Down at ``speed_mps`` within ``whole_s``."""
     t_s = shaft.times(duration)
     speed = pace(t_s, speed_mps, whole_s)
-    shaking = rails(t_s, vibration * (not nominal) * speed, stream(seed, "vibration"))
+    shaking = rails(t_s, way.vibration * (not way.nominal) * speed, stream(seed, "vibration"))
     motion = Motion(down(t_s, speed), (shaking,))
-    if survey_sd_m:
-        end = motion(np.array([duration])).position[0] + survey_sd_m * stream(seed, "survey").standard_normal(3)
-        mark = SurveyPoint(at="end", position_m=tuple(end.tolist()), sigma_m=survey_sd_m)
+    if way.survey_sd_m:
+        end = motion(np.array([duration])).position[0] + way.survey_sd_m * stream(seed, "survey").standard_normal(3)
+        mark = SurveyPoint(at="end", position_m=tuple(end.tolist()), sigma_m=way.survey_sd_m)
         machine = machine.model_copy(update={"survey": (mark,)})
-    return shaft.record(name, motion, machine, seed, duration, 0.0, 0.0, nominal, without="laser")
+    around = replace(shaft.QUIET, nominal=way.nominal)
+    return shaft.record(name, motion, machine, seed, duration, around, without="laser")
 
 
 def pace(t_s: Floats, speed_mps: float, whole_s: float) -> Floats:

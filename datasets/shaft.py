@@ -66,19 +66,29 @@ LOW = Cutter(rpm=10.0, displacement_m=0.8e-3, acceleration=0.45, rocking_deg=0.0
 HIGH = Cutter(rpm=40.0, displacement_m=1.7e-3, acceleration=0.9, rocking_deg=0.1)
 
 
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """The motor's field beside the magnetometer, the share of laser spots that dust hides, and ``nominal``: neither."""
+
+    motor_ut: float
+    dropout: float
+    nominal: int = 0
+
+
+QUIET, CUTTING = Surroundings(motor_ut=0.0, dropout=0.0), Surroundings(motor_ut=2.0, dropout=0.05)
+
+
 def static(
     machine: Rig,
     *,
     seed: int,
     duration: float = 40.0,
-    motor_ut: float = 0.0,
-    dropout: float = 0.0,
-    nominal: int = 0,
+    around: Surroundings = QUIET,
 ) -> Simulation:
     """A shaft boring machine standing level."""
     t_s = times(duration)
     motion = Motion(tilting(t_s, np.zeros((len(t_s), 3)), np.zeros((len(t_s), 3))))
-    return record("shaft-static", motion, machine, seed, duration, motor_ut, dropout, nominal)
+    return record("shaft-static", motion, machine, seed, duration, around)
 
 
 def low(
@@ -87,13 +97,11 @@ def low(
     seed: int,
     duration: float = 40.0,
     vibration: float = 1.0,
-    motor_ut: float = 2.0,
-    dropout: float = 0.05,
-    nominal: int = 0,
+    around: Surroundings = CUTTING,
 ) -> Simulation:
     """The shaft boring machine cutting on the spot at 10 turns a minute."""
-    motion = on_the_spot(LOW, duration, vibration * (not nominal), stream(seed, "vibration"))
-    return record("shaft-low", motion, machine, seed, duration, motor_ut, dropout, nominal)
+    motion = on_the_spot(LOW, duration, vibration * (not around.nominal), stream(seed, "vibration"))
+    return record("shaft-low", motion, machine, seed, duration, around)
 
 
 def high(
@@ -102,13 +110,11 @@ def high(
     seed: int,
     duration: float = 40.0,
     vibration: float = 1.0,
-    motor_ut: float = 2.0,
-    dropout: float = 0.05,
-    nominal: int = 0,
+    around: Surroundings = CUTTING,
 ) -> Simulation:
     """The shaft boring machine cutting on the spot at 40 turns a minute."""
-    motion = on_the_spot(HIGH, duration, vibration * (not nominal), stream(seed, "vibration"))
-    return record("shaft-high", motion, machine, seed, duration, motor_ut, dropout, nominal)
+    motion = on_the_spot(HIGH, duration, vibration * (not around.nominal), stream(seed, "vibration"))
+    return record("shaft-high", motion, machine, seed, duration, around)
 
 
 def dynamic(
@@ -117,16 +123,14 @@ def dynamic(
     seed: int,
     duration: float = 80.0,
     rocking_deg: float = 0.5,
-    motor_ut: float = 2.0,
-    dropout: float = 0.05,
-    nominal: int = 0,
+    around: Surroundings = CUTTING,
 ) -> Simulation:
     """The shaft boring machine turning to and fro within 17 degrees, rocking."""
     t_s, phase = times(duration), 2 * np.pi * stream(seed, "rocking").random((2, 2))
     wave = np.sin(2 * np.pi * np.multiply.outer(t_s, [[0.07, 0.19], [0.09, 0.16]]) + phase).sum(axis=2)
     rpy = np.column_stack([rocking_deg * DEG * wave, turning(t_s)])
     motion = Motion(tilting(t_s, np.zeros((len(t_s), 3)), rpy))
-    return record("shaft-dynamic", motion, machine, seed, duration, motor_ut, dropout, nominal)
+    return record("shaft-dynamic", motion, machine, seed, duration, around)
 
 
 def descend(
@@ -135,18 +139,16 @@ def descend(
     seed: int,
     duration: float = 180.0,
     vibration: float = 1.0,
-    motor_ut: float = 2.0,
-    dropout: float = 0.05,
-    nominal: int = 0,
+    around: Surroundings = CUTTING,
 ) -> Simulation:
     """The shaft boring machine sinking, drifting off and steered back."""
     t_s = times(duration)
     feed = 0.01 * smooth_step((t_s - 5.0) / 5.0)
     way, rpy = steered(t_s, feed, stream(seed, "ground"))
     cutting = Spline(t_s, (feed / 0.01)[:, None])
-    shaking = cutter(LOW, vibration * (not nominal), cutting, stream(seed, "vibration"))
+    shaking = cutter(LOW, vibration * (not around.nominal), cutting, stream(seed, "vibration"))
     motion = Motion(tilting(t_s, way, rpy), (shaking,))
-    return record("shaft-descend", motion, machine, seed, duration, motor_ut, dropout, nominal)
+    return record("shaft-descend", motion, machine, seed, duration, around)
 
 
 def record(
@@ -155,13 +157,11 @@ def record(
     machine: Rig,
     seed: int,
     duration: float,
-    motor_ut: float,
-    dropout: float,
-    nominal: int,
+    around: Surroundings,
     without: str = "",
 ) -> Simulation:
     """The log of ``motion``; ``without`` names a kind of sensor that is not on board."""
-    own = not nominal
+    own = not around.nominal
     sensors = {
         "imu": partial(imu, rate_hz=RATE_HZ),
         "magnetometer": partial(
@@ -169,7 +169,7 @@ def record(
             rate_hz=RATE_HZ,
             dip_deg=DIP_DEG,
             noise_t=15e-9 if own else None,
-            motor_t=1e-6 * motor_ut * own,
+            motor_t=1e-6 * around.motor_ut * own,
         ),
         "barometer": partial(
             barometer,
@@ -178,7 +178,7 @@ def record(
             noise_pa=1.2 if own else None,
             drift_pa_per_h=10.0,
         ),
-        "laser": partial(laser, rate_hz=RATE_HZ, dropout=dropout * own),
+        "laser": partial(laser, rate_hz=RATE_HZ, dropout=around.dropout * own),
     }
     sensors.pop(without, None)
     return simulate(name, motion, machine, sensors, seed=seed, duration_s=duration, truth_rate_hz=RATE_HZ)

@@ -45,27 +45,27 @@ def rig() -> Rig:
     return override(load_rig("shearer"), ["sensors.imu.noise_factor=1"])
 
 
-def make(
-    machine: Rig,
-    *,
-    seed: int,
-    duration: float = 85.0,
-    mti30: str = "datasheet",
-    speed_mps: float = 1.0,
-    slide: float = 1.0,
-    vibration: float = 0.0,
-    odometer_tick_mm: float = 0.0,
-    slips: int = 0,
-    residual_ut: float = 0.0,
-    field_ut: float = 53.0,
-    dip_deg: float = 55.0,
-) -> Simulation:
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What is not nominal, and the Earth's field: the options of every log of this machine."""
+
+    mti30: str = "datasheet"
+    speed_mps: float = 1.0
+    slide: float = 1.0
+    vibration: float = 0.0
+    odometer_tick_mm: float = 0.0
+    slips: int = 0
+    residual_ut: float = 0.0
+    field_ut: float = 53.0
+    dip_deg: float = 55.0
+
+
+NOMINAL = Conditions()
+
+
+def make(machine: Rig, *, seed: int, duration: float = 85.0, conditions: Conditions = NOMINAL) -> Simulation:
     """A longwall shearer cuts 40 m straight, 10 m aside over the next 20 m, and on straight."""
-    return haul(
-        "shearer-cut", machine, CUT, seed=seed, duration=duration, mti30=mti30, speed_mps=speed_mps, slide=slide,
-        vibration=vibration, odometer_tick_mm=odometer_tick_mm, slips=slips, residual_ut=residual_ut,
-        field_ut=field_ut, dip_deg=dip_deg,
-    )  # fmt: skip
+    return haul("shearer-cut", machine, CUT, seed=seed, duration=duration, conditions=conditions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,51 +112,46 @@ def haul(
     *,
     seed: int,
     duration: float,
-    mti30: str = "datasheet",
-    speed_mps: float = 1.0,
-    slide: float = 1.0,
-    vibration: float = 0.0,
-    odometer_tick_mm: float = 0.0,
-    slips: int = 0,
-    residual_ut: float = 0.0,
-    field_ut: float = 53.0,
-    dip_deg: float = 55.0,
+    conditions: Conditions,
     disturb: Disturbance | None = None,
 ) -> Simulation:
-    """The log of a machine that cuts ``face`` there and back; the other options are those of :func:`make`."""
-    if mti30 not in MTI30:
-        raise TbmfgError(f"{name}: mti30={mti30}; there are {', '.join(MTI30)}")
+    """The log of a machine that cuts ``face`` there and back."""
+    speed_mps = conditions.speed_mps
+    if conditions.mti30 not in MTI30:
+        raise TbmfgError(f"{name}: mti30={conditions.mti30}; there are {', '.join(MTI30)}")
     if speed_mps <= 0 or face.way_m < 2 * RAMP_S * speed_mps:
         raise TbmfgError(f"{name}: {speed_mps:g} m/s; it should be above 0, and reached and left within a cut")
     if "odometer" not in machine.sensors:
         raise RigError(f"{name}: the rig has no sensor called odometer; its arm_m says where the machine stands")
-    machine = override(machine, MTI30[mti30])
+    machine = override(machine, MTI30[conditions.mti30])
     shoes: Odometer = machine.sensors["odometer"]
     if shoes.yaw_deg or shoes.pitch_deg or shoes.mounting_sd_deg:
         raise RigError(f"{name}: the shoes run along b's x axis; its odometer has no yaw, pitch or mounting sd")
     t_s = np.arange(-10, int(duration / STEP_S) + 20) * STEP_S
     slid = (
-        slide
+        conditions.slide
         * shoes.lateral_sigma
         / np.sqrt(ODOMETER_HZ * STEP_S)
         * stream(seed, "slide").standard_normal((len(t_s), 2))
     )
     heading = (YAW_DEG + machine.origin.x_axis_azimuth_deg) * DEG
     travel, pace = path(face, t_s, speed_mps, heading, shoes.arm, slid)
-    shaking = cutting(t_s, pace, vibration, stream(seed, "vibration"))
+    shaking = cutting(t_s, pace, conditions.vibration, stream(seed, "vibration"))
     sensors = {
         "imu": partial(imu, rate_hz=IMU_HZ),
-        "odometer": partial(odometer, rate_hz=ODOMETER_HZ, tick_m=1e-3 * odometer_tick_mm, slips=slips),
+        "odometer": partial(
+            odometer, rate_hz=ODOMETER_HZ, tick_m=1e-3 * conditions.odometer_tick_mm, slips=conditions.slips
+        ),
         "magnetometer": partial(
             magnetometer,
             rate_hz=MAGNETOMETER_HZ,
-            field_t=1e-6 * field_ut,
-            dip_deg=dip_deg,
-            residual_ut=residual_ut,
+            field_t=1e-6 * conditions.field_ut,
+            dip_deg=conditions.dip_deg,
+            residual_ut=conditions.residual_ut,
             disturb=disturb,
         ),
     }
-    motion = Motion(travel, (shaking,) if vibration else ())
+    motion = Motion(travel, (shaking,) if conditions.vibration else ())
     return simulate(name, motion, machine, sensors, seed=seed, duration_s=duration, truth_rate_hz=IMU_HZ)
 
 

@@ -31,14 +31,19 @@ rig = shearer.rig
 
 
 def make(
-    machine: Rig, *, seed: int, duration: float = 85.0, fault: str = "offset", mti30: str = "datasheet"
+    machine: Rig,
+    *,
+    seed: int,
+    duration: float = 85.0,
+    fault: str = "offset",
+    conditions: shearer.Conditions = shearer.NOMINAL,
 ) -> Simulation:
     """The shearer's cut with a magnetic fault from 10 to 30 s: offset, field or spikes."""
     if fault not in FAULTS:
         raise TbmfgError(f"shearer-magfault: fault={fault}; there are {', '.join(FAULTS)}")
     disturb = partial(disturbed, fault, stream(seed, "fault"))
     return shearer.haul(
-        "shearer-magfault", machine, shearer.CUT, seed=seed, duration=duration, mti30=mti30, disturb=disturb
+        "shearer-magfault", machine, shearer.CUT, seed=seed, duration=duration, conditions=conditions, disturb=disturb
     )
 
 

@@ -25,19 +25,10 @@ def make(
     face_m: float = 150.0,
     web_m: float = 0.8,
     bend_m: float = 20.0,
-    speed_mps: float = 1.0,
-    mti30: str = "datasheet",
-    slide: float = 1.0,
-    vibration: float = 0.0,
-    odometer_tick_mm: float = 0.0,
-    slips: int = 0,
-    residual_ut: float = 0.0,
+    conditions: shearer.Conditions = shearer.NOMINAL,
 ) -> Simulation:
     """The shearer there and back along a whole face, cut after cut."""
     if not 0 < bend_m <= face_m - LEAD_M:
         raise TbmfgError(f"shearer-panel: a bend of {bend_m:g} m on a face of {face_m:g} m; it begins at {LEAD_M:g} m")
     face = shearer.Face(shift_m=web_m, lead_m=LEAD_M, bend_m=bend_m, length_m=face_m)
-    return shearer.haul(
-        "shearer-panel", machine, face, seed=seed, duration=duration, mti30=mti30, speed_mps=speed_mps, slide=slide,
-        vibration=vibration, odometer_tick_mm=odometer_tick_mm, slips=slips, residual_ut=residual_ut,
-    )  # fmt: skip
+    return shearer.haul("shearer-panel", machine, face, seed=seed, duration=duration, conditions=conditions)

@@ -16,13 +16,16 @@ def rig() -> Rig:
 
 
 def make(
-    machine: Rig, *, seed: int, duration: float = 180.0, dust: float = 0.2, vibration: float = 1.0,
-    imu_rate_hz: float = 475.0, lidar_rate_hz: float = 10.0, columns: int = 1800,
-) -> Simulation:  # fmt: skip
+    machine: Rig,
+    *,
+    seed: int,
+    duration: float = 180.0,
+    dust: float = 0.2,
+    setup: tbm_scenes.Setup = tbm_scenes.SETUP,
+) -> Simulation:
     """That machine, its heading unknown and its pump running from the beginning."""
-    rates = {"imu_rate_hz": imu_rate_hz, "lidar_rate_hz": lidar_rate_hz, "columns": columns}
     air = tbm_roadway.air(dust, 0.35 * duration, 0.75 * duration)
+    moves = tbm_scenes.TURN
     return tbm_scenes.scene(
-        "tbm-ablation", machine, tbm_scenes.TURN, seed=seed, duration=duration, vibration=vibration, air=air,
-        pump_first=True, **rates,
-    )  # fmt: skip
+        "tbm-ablation", machine, moves, seed=seed, duration=duration, setup=setup, air=air, pump_first=True
+    )

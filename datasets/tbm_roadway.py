@@ -48,7 +48,10 @@ def make(
     columns: int = 1800,
     truth_rate_hz: float | None = None,
 ) -> Simulation:
-    """``dust`` is the extinction in 1/m, in the air between the shares ``dust_begin`` and ``dust_end`` of the log."""
+    """The drive of tbm-drive in a roadway that a LiDAR sees, in clean air or in dust.
+
+    ``dust`` is the extinction in 1/m, in the air between the shares ``dust_begin`` and ``dust_end`` of the log.
+    """
     plan = tbm.Plan.over(duration)
     extinction, visibility = air(dust, dust_begin * duration, dust_end * duration)
     sensors = {

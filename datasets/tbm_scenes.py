@@ -6,7 +6,7 @@ m/s; their trajectory is not published but for its length.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -30,24 +30,37 @@ def rig() -> Rig:
     return machine.model_copy(update={"sensors": {name: machine.sensors[name] for name in SENSORS}})
 
 
-def clean(
-    machine: Rig, *, seed: int, duration: float = 125.0, vibration: float = 1.0, imu_rate_hz: float = 475.0,
-    lidar_rate_hz: float = 10.0, columns: int = 1800,
-) -> Simulation:  # fmt: skip
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """How the machine shakes and how often its sensors measure; ``columns`` of 16 points in a scan."""
+
+    vibration: float = 1.0
+    imu_rate_hz: float = 475.0
+    lidar_rate_hz: float = 10.0
+    columns: int = 1800
+
+
+SETUP = Setup()
+
+
+def clean(machine: Rig, *, seed: int, duration: float = 125.0, setup: Setup = SETUP) -> Simulation:
     """The roadheader with LiDAR and total station, 4.7 m forward and back in clean air."""
-    rates = {"imu_rate_hz": imu_rate_hz, "lidar_rate_hz": lidar_rate_hz, "columns": columns}
-    return scene("tbm-clean", machine, STRAIGHT, seed=seed, duration=duration, vibration=vibration, **rates)
+    return scene("tbm-clean", machine, STRAIGHT, seed=seed, duration=duration, setup=setup)
 
 
 def dust(
-    machine: Rig, *, seed: int, duration: float = 180.0, dust: float = 0.2, dust_begin: float = 0.35,
-    dust_end: float = 0.75, vibration: float = 1.0, imu_rate_hz: float = 475.0, lidar_rate_hz: float = 10.0,
-    columns: int = 1800,
-) -> Simulation:  # fmt: skip
+    machine: Rig,
+    *,
+    seed: int,
+    duration: float = 180.0,
+    dust: float = 0.2,
+    dust_begin: float = 0.35,
+    dust_end: float = 0.75,
+    setup: Setup = SETUP,
+) -> Simulation:
     """The same machine forward, to the left and back, in dust that hides walls and prism."""
-    rates = {"imu_rate_hz": imu_rate_hz, "lidar_rate_hz": lidar_rate_hz, "columns": columns}
     air = tbm_roadway.air(dust, dust_begin * duration, dust_end * duration)
-    return scene("tbm-dust", machine, TURN, seed=seed, duration=duration, vibration=vibration, air=air, **rates)
+    return scene("tbm-dust", machine, TURN, seed=seed, duration=duration, setup=setup, air=air)
 
 
 def scene(
@@ -57,10 +70,7 @@ def scene(
     *,
     seed: int,
     duration: float,
-    vibration: float,
-    imu_rate_hz: float,
-    lidar_rate_hz: float,
-    columns: int,
+    setup: Setup,
     air: tuple = (None, None),
     pump_first: bool = False,
 ) -> Simulation:
@@ -70,12 +80,15 @@ def scene(
     plan = tbm.Plan.over(duration, moves)
     plan = replace(plan, pump=np.ones(len(plan.t_s))) if pump_first else plan
     travel = tbm.path(plan, CONTACT_B, 0.0, stream(seed, "slide"))
+    world = tbm_roadway.world(seed)
     sensors = {
-        "imu": partial(imu, rate_hz=imu_rate_hz),
+        "imu": partial(imu, rate_hz=setup.imu_rate_hz),
         "prism": partial(prism, rate_hz=5.0, visibility=visibility),
-        "lidar": partial(lidar, world=tbm_roadway.world(seed), rate_hz=lidar_rate_hz, columns=columns, dust=extinction),
+        "lidar": partial(
+            lidar, world=tbm_roadway.world(seed), rate_hz=setup.lidar_rate_hz, columns=setup.columns, dust=extinction
+        ),
     }
-    shaking = tbm.shaking(plan, vibration, stream(seed, "vibration")) if vibration else ()
+    shaking = tbm.shaking(plan, setup.vibration, stream(seed, "vibration")) if setup.vibration else ()
     return simulate(
-        name, Motion(travel, shaking), machine, sensors, seed=seed, duration_s=duration, truth_rate_hz=imu_rate_hz
+        name, Motion(travel, shaking), machine, sensors, seed=seed, duration_s=duration, truth_rate_hz=setup.imu_rate_hz
     )

@@ -48,7 +48,10 @@ def make(
     columns: int = 1800,
     truth_rate_hz: float | None = None,
 ) -> Simulation:
-    """``duration`` s in the tunnel; ``walls`` smooth or ribbed; ``columns`` of 16 points in a scan."""
+    """A roadheader down an endless tunnel by IMU, odometer and LiDAR; walls smooth or ribbed.
+
+    ``columns`` of 16 points in a scan.
+    """
     if walls not in WALLS:
         raise TbmfgError(f"tbm-tunnel: walls={walls}: should be {' or '.join(WALLS)}")
     plan = _plan(duration)

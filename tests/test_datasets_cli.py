@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
@@ -22,11 +23,11 @@ def test_list_names_every_dataset_and_its_options(capsys):
 
 def test_made_log_reads_back(tmp_path, capsys):
     path = tmp_path / "drive.mcap"
-    options = ["--set", "prism_rate_hz=2", "--set", "sensors.prism.sigma_mm=2"]
+    options = ["--set", "prism_rate_hz=2", "--set", "truth_rate_hz=50", "--set", "sensors.prism.sigma_mm=2"]
     assert main(["make", "tbm-drive", "-o", str(path), "--seed", "7", "--duration", "4", *options]) == 0
     assert "/prism/position 8" in capsys.readouterr().out
     simulation = datasets.make(
-        "tbm-drive", seed=7, duration=4.0, prism_rate_hz=2.0, settings=("sensors.prism.sigma_mm=2",)
+        "tbm-drive", seed=7, duration=4.0, prism_rate_hz=2.0, truth_rate_hz=50.0, settings=("sensors.prism.sigma_mm=2",)
     )
     log = read_log(path)
     assert set(log.series) == {series.topic for series in simulation.log_series}
@@ -54,6 +55,17 @@ def test_faults_are_one_line_and_exit_1(arguments, message, tmp_path, capsys):
     assert message in printed
     assert printed.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_options_that_datasets_share_are_options_of_each():
+    shared = ("mti30", "speed_mps", "vibration", "field_ut")
+    for name in ("shearer-cut", "shearer-panel", "shearer-magfault"):
+        assert set(shared) <= set(datasets.defaults(name))
+    slow = datasets.make("shearer-panel", duration=20.0, speed_mps=0.5, face_m=60.0)
+    fast = datasets.make("shearer-panel", duration=20.0, face_m=60.0)
+    ways = [np.linalg.norm(np.ptp(one.truth(np.array([0.0, 20.0])).position, axis=0)) for one in (slow, fast)]
+    assert ways[0] == pytest.approx(0.5 * 19, rel=0.02)  # less half of the 2 s that it takes to speed up
+    assert ways[1] == pytest.approx(19, rel=0.02)
 
 
 def test_usage_exits_2():
