@@ -84,9 +84,7 @@ def scene(
     sensors = {
         "imu": partial(imu, rate_hz=setup.imu_rate_hz),
         "prism": partial(prism, rate_hz=5.0, visibility=visibility),
-        "lidar": partial(
-            lidar, world=tbm_roadway.world(seed), rate_hz=setup.lidar_rate_hz, columns=setup.columns, dust=extinction
-        ),
+        "lidar": partial(lidar, world=world, rate_hz=setup.lidar_rate_hz, columns=setup.columns, dust=extinction),
     }
     shaking = tbm.shaking(plan, setup.vibration, stream(seed, "vibration")) if setup.vibration else ()
     return simulate(
