@@ -7,6 +7,7 @@ the rig's prior. A sensor is a function of the scene, its part of the rig and it
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ LOAD_HZ = 0.05  # of a motor's load
 AIR_K = 295.15  # what a thermometer in the shaft says
 AIR_GAS = 287.05  # of dry air, J/kg/K
 WARMING = 9.8e-3  # of air that sinks without heat, K/m
+STANDARD_WARMING = 6.5e-3  # of the atmosphere that pressure is turned into height with, K/m
 
 # Times (n,) s, R_nb (n, 3, 3), the Earth's field in n (3,) T -> what is added to it in n, (n, 3) T, and what was drawn.
 Disturbance = Callable[[Floats, Floats, Floats], tuple[Floats, dict[str, Any]]]
@@ -208,16 +210,17 @@ def barometer(
     drift_pa_per_h: float,
 ) -> Sensed:
     """Air pressure, Pa, in a shaft whose air is not as warm as its thermometer says: ``air_k`` of ``drawn``, by which
-    heights have a scale error of the rig's sd.
+    heights have a scale error of the rig's sd. It warms downwards by WARMING.
 
     The unit converts ``update_hz`` times a second and is read ``rate_hz`` times. ``drift_pa_per_h`` is the sd of the
     weather's trend. Without ``noise_pa`` every error is the rig's: each reading is fresh, its noise white, its drift
-    a random walk.
+    a random walk, and the air warms as the rig's ``lapse_sd_kpkm`` allows.
     """
     t_ns = ticks(scene.duration_s, rate_hz)
     depth = -scene.motion(t_ns * 1e-9).position[:, 2]
     warmth, weather, trend = rng.standard_normal(3)
     white, steps = rng.standard_normal((len(t_ns), 2)).T
+    lapse = rng.standard_normal()
     air_k = AIR_K / (1.0 + sensor.scale_sd * warmth)
     middle_m = (depth.min() + depth.max()) / 2
     gravity = -scene.gravity_n[2]
@@ -228,7 +231,11 @@ def barometer(
         stamps = START_NS + t_ns + round(offset_s * NS)
         return Series(sensor.topic, "sensor_msgs/msg/FluidPressure", stamps, {"pressure": pascals}, "barometer")
 
-    clean = shaft_pressure(depth, collar_pa, air_k, middle_m, gravity)
+    warming = STANDARD_WARMING + sensor.lapse_sd * lapse if noise_pa is None else WARMING
+    column = partial(
+        shaft_pressure, collar_pa=collar_pa, air_k=air_k, middle_m=middle_m, gravity=gravity, warming=warming
+    )
+    clean = column(depth)
     if noise_pa is None:
         walk = sensor.bias_walk / np.sqrt(rate_hz) * np.cumsum(steps)
         error_m = sensor.sigma_m * white + walk
@@ -238,22 +245,21 @@ def barometer(
         t_s = converted / update_hz
         then = -scene.motion(t_s).position[:, 2]
         drift = drift_pa_per_h / 3600 * trend * t_s
-        measured, offset_s = (
-            shaft_pressure(then, collar_pa, air_k, middle_m, gravity) + drift + noise_pa * white[converted],
-            0.0,
-        )
-    drawn = {"air_k": air_k, "collar_pa": collar_pa}
+        measured, offset_s = column(then) + drift + noise_pa * white[converted], 0.0
+    drawn = {"air_k": air_k, "collar_pa": collar_pa, "warming": warming}
     return Sensed(series(offset_s, measured), series(0.0, clean), drawn)
 
 
-def shaft_pressure(depth: Floats, collar_pa: float, air_k: float, middle_m: float, gravity: float) -> Floats:
+def shaft_pressure(
+    depth: Floats, collar_pa: float, air_k: float, middle_m: float, gravity: float, warming: float = WARMING
+) -> Floats:
     """Pressure, Pa, at ``depth`` (n,) m in a column of dry air, ``air_k`` warm at ``middle_m``.
 
-    Hydrostatics, dp = p g / (R T) dh, in air that warms by WARMING on its way down.
+    Hydrostatics, dp = p g / (R T) dh, in air that warms by ``warming`` K/m on its way down.
     """
-    warmth = air_k + WARMING * (depth - middle_m)
-    at_collar = air_k - WARMING * middle_m
-    return collar_pa * (warmth / at_collar) ** (gravity / (AIR_GAS * WARMING))
+    warmth = air_k + warming * (depth - middle_m)
+    at_collar = air_k - warming * middle_m
+    return collar_pa * (warmth / at_collar) ** (gravity / (AIR_GAS * warming))
 
 
 def laser(

@@ -24,7 +24,7 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
     for k in parameters.free:
         sensor, _, what = parameters.names[k].rpartition(".")
         if kind_of(sensor) == "barometer":
-            lines += _depth(problem, path, sensor, float(sd[k]))
+            lines += _depth(problem, path, sensor, what, float(sd[k]))
         elif sd[k] > UNOBSERVED * parameters.sd[k]:
             lines.append(
                 f"{parameters.names[k]} is not observable on this log: its sd stays {sd[k]:.3g} of the prior's "
@@ -33,16 +33,22 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
     return lines
 
 
-def _depth(problem: Problem, path: Trajectory, sensor: str, scale_sd: float) -> list[str]:
-    """Say where the air's temperature, which is a barometer's scale, costs more than the barometer's noise."""
+def _depth(problem: Problem, path: Trajectory, sensor: str, what: str, sd: float) -> list[str]:
+    """Say where the air's temperature, a barometer's ``scale``, or its ``lapse`` with height costs more than the
+    barometer's noise."""
     way = float(np.ptp(path.position_n[:, 2]))
-    if scale_sd * way < problem.rig.sensors[sensor].sigma:
+    between = f"over the {way:.3g} m between highest and lowest"
+    if what == "lapse":
+        bulge = sd * way**2 / 8 / 288.15  # of a parabola through both ends
+        line = f"how the air cools with height: to {1e3 * sd:.2g} K/km (1 sd), {bulge:.2g} m halfway {between}"
+        remedy = "a point surveyed halfway"
+    else:
+        bulge = sd * way
+        line = f"the air's temperature: its scale is known to {sd:.2%} (1 sd), {bulge:.2g} m {between}"
+        remedy = "a point surveyed at another height"
+    if bulge < problem.rig.sensors[sensor].sigma:
         return []
-    return [
-        f"{sensor}: depth is limited by the air's temperature: its scale is known to {scale_sd:.2%} (1 sd), "
-        f"{scale_sd * way:.2g} m over the {way:.3g} m between highest and lowest; a point surveyed at another height, "
-        "gnss or a prism would tell it"
-    ]
+    return [f"{sensor}: depth is limited by {line}; {remedy}, gnss or a prism would tell it"]
 
 
 def _motion(path: Trajectory, what: str) -> str:

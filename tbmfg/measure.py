@@ -237,11 +237,12 @@ def barometer_rows(
     calib: slice,
 ) -> Rows:
     """Pressure heights averaged to the nearest keyframe; ``heights.values`` (n,) m; ``drift`` the index of the bias,
-    ``reference`` the height above ``origin_n`` from which on the scale counts."""
+    ``reference`` the height above ``origin_n`` from which on the scale counts. It holds at the median height."""
     t = heights.t_s - sensor.clock_offset
     k = nearest(keyframes_s, t)
     used, mean, count = _group(k, np.column_stack([heights.values - origin_n[2], t - keyframes_s[k]]))
-    data = np.column_stack([mean[:, 1], np.full(len(used), drift), np.full(len(used), reference)])
+    middle = np.median(heights.values) - origin_n[2]
+    data = np.column_stack([mean[:, 1], np.tile([float(drift), reference, middle], (len(used), 1))])
     sigma = (sensor.sigma / np.sqrt(count))[:, None]
     return Rows(heights.sensor, "barometer", used, used, mean[:, :1], data, sigma, calib, count, sensor.loss)
 

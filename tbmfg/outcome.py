@@ -139,6 +139,8 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             found[f"{sensor}_offset_m"] = Calibrated(tuple(c[k : k + 2]), tuple(sd[k : k + 2]), estimated)
         elif what == "scale":
             found[f"{sensor}_scale"] = Calibrated(c[k], sd[k], estimated)
+        elif what == "lapse":
+            found[f"{sensor}_lapse_kpkm"] = Calibrated(1e3 * c[k], 1e3 * sd[k], estimated)
     return found
 
 

@@ -197,19 +197,22 @@ def magnetometer(z, data, xi, xj, c):
 
 @njit(cache=True)
 def barometer(z, data, xi, xj, c):
-    """Pressure height: h = z + s (z - z_0) + bias with z = p_z + v_z lag.
+    """Pressure height: h = z + s (z - z_0) + l / 2T ((z - z_m)^2 - (z_0 - z_m)^2) + bias with z = p_z + v_z lag.
 
-    z (1) [m]; data (3): mean lag [s], index of the bias among the drifting calibrations, z_0 [m] at which the bias is
-    counted; c (1): scale s, which is the air's density against the one that pressure was turned into height with.
+    z (1) [m]; data (4): mean lag [s], index of the bias among the drifting calibrations, z_0 [m] at which the bias is
+    counted, z_m at which the scale holds; c (2): scale s, the air's density against the one that pressure was turned
+    into height with, and l [K/m], by how much faster it cools with height. T is 288.15 K.
     """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 1))
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 2))
     for k in range(n):
         x, drift = xi[k], int(data[k, 1])
         height = x[11] + x[14] * data[k, 0]
-        r[k, 0] = height + c[0] * (height - data[k, 2]) + x[21 + drift] - z[k, 0]
-        Ji[k, 0, 5], Ji[k, 0, 8], Ji[k, 0, 15 + drift] = 1.0 + c[0], (1.0 + c[0]) * data[k, 0], 1.0
-        Jc[k, 0, 0] = height - data[k, 2]
+        off, begin = height - data[k, 3], data[k, 2] - data[k, 3]
+        Jc[k, 0, 0], Jc[k, 0, 1] = height - data[k, 2], (off * off - begin * begin) / (2.0 * 288.15)
+        r[k, 0] = height + c[0] * Jc[k, 0, 0] + c[1] * Jc[k, 0, 1] + x[21 + drift] - z[k, 0]
+        slope = 1.0 + c[0] + c[1] * off / 288.15
+        Ji[k, 0, 5], Ji[k, 0, 8], Ji[k, 0, 15 + drift] = slope, slope * data[k, 0], 1.0
     return r, Ji, np.zeros((n, 1, 0)), Jc
 
 

@@ -48,3 +48,21 @@ def test_without_a_reference_depth_is_said_to_hang_on_the_temperature():
     assert 0.5 * 0.007 * way < sd
     assert abs(error) < 4.0 * sd
     assert any("depth is limited by the air's temperature" in line for line in result.warnings)
+
+
+def test_between_surveyed_depths_the_airs_own_cooling_is_the_limit():
+    """A shaft's dry air cools by 9.8 K/km, the standard atmosphere by 6.5: 3.3 / 288 / 1000 / 8 * 430^2 m halfway."""
+    options = {"vibration": 0.0, "survey_sd_m": 0.05}
+    simulation = datasets.make("cage-fast", seed=0, duration=135.3, **options)
+    known, unknown = (
+        estimate("batch", prepare(log_of(simulation.log_series), override(simulation.rig, (*SETTINGS, lapse))))
+        for lapse in ("sensors.barometer.lapse_sd_kpkm=0", "sensors.barometer.lapse_sd_kpkm=3")
+    )
+    path = unknown.trajectory
+    true = simulation.truth((path.t_ns - simulation.start_ns) * 1e-9).position[:, 2]
+    halfway = int(np.argmin(np.abs(true + 215.0)))
+    sd, sd_known = (np.sqrt(result.trajectory.cov[halfway, 5, 5]) for result in (unknown, known))
+    assert abs(path.position_n[halfway, 2] - true[halfway]) < 2.0 * sd
+    bulge = 3e-3 / 288.15 * 430.0**2 / 8
+    assert 0.25 * bulge < np.sqrt(sd**2 - sd_known**2) < bulge  # the accelerometer tells a part of it
+    assert any("depth is limited by how the air cools" in line for line in unknown.warnings)

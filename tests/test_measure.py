@@ -179,10 +179,10 @@ def test_barometer_rows_hold_at_truth(world):
     keyframes = np.linspace(frame.steps.edges_s[0], frame.steps.end_s, 201)
     origin_n = np.array([0.0, 0.0, 3.0])
     rows = measure.barometer_rows(
-        sensor, Samples("barometer", t_s - 0.01, heights), keyframes, origin_n, 0, 1.5, slice(0, 1)
+        sensor, Samples("barometer", t_s - 0.01, heights), keyframes, origin_n, 0, 1.5, slice(0, 2)
     )
     x = np.hstack([states(simulation, keyframes + zero_s, origin_n), np.full((201, 1), 7.5)])
-    residual, *_ = rows.evaluate(x, np.zeros(1))
+    residual, *_ = rows.evaluate(x, np.zeros(2))
     # mean over a tenth of a second: the vertical acceleration is below 6 m/s^2
     assert np.abs(residual * rows.sigma).max() < 0.5 * 6.0 * 0.05**2
     assert rows.samples.sum() == len(t_s)

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import quad
 
 from tbmfg import sensors
 from tbmfg.geometry import exp_so3, rotation_from_rpy
@@ -38,7 +39,7 @@ CASES = {
     "wheel": ([1.3], [-0.4, 0.3, -1.1, 0.7, -1.1, 0.9, 1.1], [0.07, 0.21, -0.13], 10.0),
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
     "magnetometer": ([14.0, -17.0, -31.0], [0.4, *(1.3 * R_BD).ravel()], [0.05, 0.8, -0.5, 1.1], 20.0),
-    "barometer": ([11.2], [0.04, 1.0, 3.0], [0.02], 20.0),
+    "barometer": ([11.2], [0.04, 1.0, 3.0, -2.0], [0.02, 1.3], 20.0),
     "position": ([39.0, -69.0, 11.0], [], [], 80.0),
     # tilted by some 20 degrees, 15 m above z = 0: third derivatives grow as the distance over cos^4
     "laser": (
@@ -56,7 +57,7 @@ CALIBRATIONS = {
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination", "iron.x", "iron.y", "iron.z"],
-    "barometer": ["scale"],
+    "barometer": ["scale", "lapse"],
     "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
 
@@ -253,8 +254,10 @@ def test_magnetometer_at_truth_and_across_the_branch_cut():
 
 def test_barometer_bound_and_velocity_at_truth():
     above = X_I[11] + 0.04 * X_I[14] - 3.0
-    height, data = 3.0 + 1.02 * above + X_I[22], np.array([[0.04, 1.0, 3.0]])
-    residual, *_ = sensors.barometer(np.array([[height]]), data, X_I[None], X_I[None], np.array([0.02]))
+    # scale 1.02 at 5 m, and from there on 0.5 / 288.15 more for each metre: added up from 3 m on
+    bent = quad(lambda z: 1.02 + 0.5 / 288.15 * (z - 5.0), 3.0, 3.0 + above)[0]
+    height, data = 3.0 + bent + X_I[22], np.array([[0.04, 1.0, 3.0, 5.0]])
+    residual, *_ = sensors.barometer(np.array([[height]]), data, X_I[None], X_I[None], np.array([0.02, 0.5]))
     assert residual[0, 0] == pytest.approx(0.0, abs=4 * EPS * 12)
     for model, z in (("velocity", X_I[12:15]), ("bounded", X_I[9:15])):
         residual, *_ = MODELS[model](z[None], np.zeros((1, 0)), X_I[None], X_I[None], np.zeros(0))

@@ -299,8 +299,8 @@ def barometer_rows(problem, truth_z, bias, rng):
     n = len(problem.keyframe_edges)
     k, one = np.arange(n), np.ones(n, dtype=int)
     z = (truth_z + bias + 0.1 * rng.standard_normal(n))[:, None]
-    scale = slice(len(problem.parameters.names), len(problem.parameters.names) + 1)
-    return Rows("barometer", "barometer", k, k, z, np.zeros((n, 3)), np.full((n, 1), 0.1), scale, one)
+    scale = slice(len(problem.parameters.names), len(problem.parameters.names) + 2)
+    return Rows("barometer", "barometer", k, k, z, np.zeros((n, 4)), np.full((n, 1), 0.1), scale, one)
 
 
 def test_a_drifting_bias_is_followed():
@@ -312,7 +312,7 @@ def test_a_drifting_bias_is_followed():
     height = solved(plain).x[:, 11]
     prior, known = plain.prior, plain.parameters
     known = Parameters(
-        (*known.names, "barometer.scale"), *(np.append(v, 0.0) for v in (known.mean, known.sd, known.start))
+        (*known.names, "barometer.scale", "barometer.lapse"), *(np.append(v, [0.0, 0.0]) for v in (known.mean, known.sd, known.start))
     )
     cov = np.zeros((16, 16))
     cov[:15, :15], cov[15, 15] = prior.cov, 5.0**2

@@ -194,6 +194,7 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
             entries += [(f"{name}.turn_{axis}", 0.0, sensor.rpy_sd) for axis in "xyz"]
         elif isinstance(sensor, Barometer):
             entries += [(f"{name}.scale", sensor.scale_at(float(np.median(samples[name].values))), sensor.scale_sd)]
+            entries += [(f"{name}.lapse", 0.0, sensor.lapse_sd)]
         elif isinstance(sensor, Laser):
             entries += [(f"{name}.tilt_{axis}", sensor.tilt[k], sensor.tilt_sd) for k, axis in enumerate("xy")]
             entries += [(f"{name}.offset_{axis}", 0.0, sensor.offset_sd) for axis in "xy"]

@@ -237,11 +237,15 @@ class Barometer(Sensor):
     scale_sd: CalibrationSd = Field(
         0.0, description="Of the scale of height, 0.0035 for each degree that air_c may be wrong; 0 or null: known."
     )
+    lapse_sd_kpkm: CalibrationSd = Field(
+        0.0, description="Of the air's cooling with height about the standard atmosphere's 6.5 K/km; 0 or null: known."
+    )
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
     sigma = si("sigma_m")
     bias_sd = si("bias_sd_m")
+    lapse_sd = si("lapse_sd_kpkm", 1e-3)
     clock_offset = si("clock_offset_s")
 
     def scale_at(self, height_m: float) -> float:
