@@ -312,7 +312,8 @@ def test_a_drifting_bias_is_followed():
     height = solved(plain).x[:, 11]
     prior, known = plain.prior, plain.parameters
     known = Parameters(
-        (*known.names, "barometer.scale", "barometer.lapse"), *(np.append(v, [0.0, 0.0]) for v in (known.mean, known.sd, known.start))
+        (*known.names, "barometer.scale", "barometer.lapse"),
+        *(np.append(v, [0.0, 0.0]) for v in (known.mean, known.sd, known.start)),
     )
     cov = np.zeros((16, 16))
     cov[:15, :15], cov[15, 15] = prior.cov, 5.0**2
