@@ -1,19 +1,25 @@
 """Command line and pipeline: exit codes, one-line errors, options as given, and nothing drawn in a pipe."""
 
+import io
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
-from tbmfg import cli, pipeline
+from tbmfg import cli, doctor, pipeline
 from tbmfg.cli import options, terminal
+from tbmfg.cli.terminal import Terminal
 from tbmfg.errors import EstimationError, LogError, TbmfgError
 from tbmfg.rig import parse_rig
 from tbmfg.state import Calibrated, Counts, Result, Trajectory
@@ -212,19 +218,127 @@ def test_python_users_get_the_summary_without_files(toy, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_progress_is_drawn_on_a_terminal_only(toy, tmp_path, monkeypatch):
+def test_a_pipe_gets_no_progress(toy, tmp_path):
     ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path))
     assert toy.prepare[0]["progress"] is None
     assert ran.stderr == ""
-    monkeypatch.setattr(terminal.sys, "stderr", SimpleNamespace(isatty=lambda: True, write=len, flush=lambda: None))
-    with terminal.progress_bar("reading") as progress:
-        progress("solving", 0.5)
 
 
 def test_estimators_lists_names_needs_and_source(toy):
     ran = tbmfg("estimators")
     assert ran.exit_code == 0
     assert all(word in ran.stdout for word in ("batch", "fixed-lag", "imu, prism", "Smoother."))
+
+
+# ---- how much is said ----
+
+
+def test_quiet_says_nothing_and_json_nothing_else(toy, tmp_path):
+    quiet = tbmfg("run", "toy.mcap", "-o", str(tmp_path / "quiet"), "--quiet")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    for arguments, file in (
+        (["run", "toy.mcap", "-o", str(tmp_path / "run")], "summary.json"),
+        (["compare", "toy.mcap", "-o", str(tmp_path / "both"), "--estimators", "batch,fixed-lag"], "compare.json"),
+    ):
+        told = tbmfg(*arguments, "--json")
+        assert told.stderr == ""
+        assert json.loads(told.stdout) == json.loads((Path(arguments[3]) / file).read_text())
+    assert list(json.loads(tbmfg("estimators", "--json").stdout)) == ["batch", "fixed-lag"]
+    assert "absent.mcap: no such file" in fault("run", "absent.mcap", "-o", str(tmp_path / "no"), "--json")
+    assert "absent.mcap: no such file" in fault("run", "absent.mcap", "-o", str(tmp_path / "no"), "--quiet")
+
+
+def test_levels_say_the_stages(toy, tmp_path):
+    ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--log-level", "info")
+    assert [line.split(":")[1] for line in ran.stderr.splitlines()] == [" reading", " solving"]
+    assert tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--quiet", "--debug").exit_code == 2
+
+
+def test_the_bar_shows_stage_and_what_remains(monkeypatch):
+    drawn = io.StringIO()
+    drawn.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", drawn)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for colour in (True, False):
+        drawn.seek(0)
+        drawn.truncate()
+        with Terminal().progress("reading") as progress:
+            for share in (0.2, 0.4, 0.6):
+                progress("solving", share)
+                time.sleep(0.11)  # the bar is drawn ten times a second
+        assert "solving" in drawn.getvalue()
+        assert "left" in drawn.getvalue()
+        assert bool(re.search(r"\x1b\[[\d;]*3\dm", drawn.getvalue())) is colour
+        monkeypatch.setenv("NO_COLOR", "1")
+
+
+def test_colour_is_for_terminals(monkeypatch):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert terminal.coloured("x", "red", SimpleNamespace(isatty=lambda: False)) == "x"
+    screen = SimpleNamespace(isatty=lambda: True)
+    assert terminal.coloured("x", "red", screen) != "x"
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert terminal.coloured("x", "red", screen) == "x"
+
+
+@pytest.mark.parametrize("name", [command.name for command in cli.app.registered_commands])
+def test_every_command_has_examples_that_parse(name):
+    """And none of them names a file that an example before it has made."""
+    commands = get_command(cli.app).commands
+    told = tbmfg(name, "--help").stdout
+    examples = told.split("Examples:\n")[1].split("\n\n")[0].splitlines()
+    for example in examples:
+        program, other, *words = shlex.split(re.split(r" {3,}|\|| > ", example.strip())[0])
+        assert program == "tbmfg"
+        commands[other].make_context(other, words)
+    assert any(example.split()[1] == name for example in examples)
+
+
+def test_completion_knows_estimators_and_rigs():
+    assert "ins" in options.estimator_names("i")
+    assert "batch,ins" in options.estimator_names("batch,i")
+    assert options.rig_names("tb") == ["tbm"]
+    shown = subprocess.run(
+        [sys.executable, "-m", "tbmfg", "--show-completion", "bash"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert "_TBMFG_COMPLETE" in shown.stdout
+
+
+# ---- the installation ----
+
+
+def test_doctor_finds_all_well_and_says_what_is_missing(monkeypatch):
+    monkeypatch.setattr(doctor, "REQUIRED", ("gtsam", "mcap_ros2"))
+    monkeypatch.setattr(doctor, "OPTIONAL", {})
+    well = tbmfg("doctor")
+    assert well.exit_code == 0, well.output
+    assert "ok     gtsam: " in well.stdout
+    assert "smoothed to" in well.stdout
+    assert "broken" not in well.stdout
+    monkeypatch.setattr(doctor, "REQUIRED", ("numpy", "no_such_package"))
+    monkeypatch.setattr(doctor, "OPTIONAL", {"no_such_option": "nothing"})
+    monkeypatch.setattr(doctor, "_self_test", lambda: 1 / 0)
+    ill = tbmfg("doctor", "--json")
+    assert ill.exit_code == 1
+    found = {check["name"]: check for check in json.loads(ill.stdout)}
+    assert found["no_such_package"]["state"] == "broken"
+    assert "pip install no-such-package" in found["no_such_package"]["remedy"]
+    assert found["no_such_option"]["state"] == "absent"
+    assert "ZeroDivisionError" in found["self-test"]["found"]
+
+
+def test_the_self_test_sees_an_estimate_that_is_off(monkeypatch):
+    def shifted(rng):
+        log, truth = circle(rng)
+        return log, lambda t_s: truth(t_s) + np.array([0.0, 0.1, 0.0])
+
+    circle = doctor.circle
+    monkeypatch.setattr(doctor, "circle", shifted)
+    with pytest.raises(ArithmeticError, match="of its sds off"):
+        doctor._self_test()
 
 
 # ---- faults ----

@@ -86,17 +86,17 @@ def test_rigs_parse(page, registries, monkeypatch):
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
 def test_commands_parse(page):
     """Every command of tbmfg on the page, in a block or in a sentence, has the options that it is shown with."""
-    commands = typer.main.get_command(app).commands
+    program = typer.main.get_command(app)
     text = page.read_text("utf-8")
     lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
     lines += re.findall(r"`(tbmfg [^`]*)`", text)
     for line in lines:
-        program, *words = line.split("#")[0].split() or [""]
-        if program != "tbmfg":
+        name, *words = line.split("#")[0].split() or [""]
+        if name != "tbmfg":
             continue
-        command = commands[words[0]]
+        command = program if words[0].startswith("-") else program.commands[words.pop(0)]
         options = {name for parameter in command.params for name in parameter.opts}
-        shown = {word.split("=")[0] for word in words[1:] if re.match(r"--?[a-z]", word)}
+        shown = {word.split("=")[0] for word in words if re.match(r"--?[a-z]", word)}
         assert shown <= options, line
 
 

@@ -25,6 +25,7 @@ LEVELS = (
     ("estimators", "bounds", "report"),
     ("pipeline",),
     ("batch", "api", "mapping"),
+    ("doctor",),
     ("cli",),
     ("__main__",),
 )

@@ -74,7 +74,7 @@ def test_simulated_clock_is_noticed():
     ],
 )
 def test_text_names_every_topic(name):
-    text = info_text(data(name))
+    text = info_text(describe(data(name)))
     for topic in describe(data(name)).topics:
         assert sum(line.split()[:1] == [topic.topic] for line in text.splitlines()) == 1
     assert "nan" not in text
@@ -114,7 +114,7 @@ def test_gaps_count_from_the_first_imu_sample(tmp_path):
     prism = next(topic for topic in describe(tmp_path / "x.mcap").topics if topic.role == "prism")
     assert prism.gaps == (Gap(pytest.approx(3.9), pytest.approx(1.1)), Gap(pytest.approx(6.9), pytest.approx(0.7)))
     assert prism.interval_s == pytest.approx(0.1)
-    assert "longest: 1.10 s at 3.90 s, 0.70 s at 6.90 s" in info_text(tmp_path / "x.mcap")
+    assert "longest: 1.10 s at 3.90 s, 0.70 s at 6.90 s" in info_text(describe(tmp_path / "x.mcap"))
 
 
 def test_gaps_without_an_imu_count_from_the_topic(tmp_path):
@@ -126,7 +126,7 @@ def test_a_single_message_has_no_rate(tmp_path):
     write_log(tmp_path / "x.mcap", [series([0])])
     topic = only_topic(tmp_path / "x.mcap")
     assert np.isnan([topic.rate_hz, topic.interval_s]).all()
-    assert "nan" not in info_text(tmp_path / "x.mcap")
+    assert "nan" not in info_text(describe(tmp_path / "x.mcap"))
 
 
 def test_delay_and_counts(tmp_path):
@@ -138,7 +138,7 @@ def test_delay_and_counts(tmp_path):
     assert topic.log_delay_s == pytest.approx((0.01, 0.02, 0.03), abs=1e-6)
     assert topic.counts == StreamCounts(received=20, nonfinite=1)
     assert topic.problems == ()
-    assert "1 of 20 messages hold a NaN or infinity" in info_text(tmp_path / "x.mcap")
+    assert "1 of 20 messages hold a NaN or infinity" in info_text(describe(tmp_path / "x.mcap"))
 
 
 def test_text_lists_transforms_attachments_and_damage(tmp_path):
@@ -148,7 +148,7 @@ def test_text_lists_transforms_attachments_and_damage(tmp_path):
     broken = bytearray(path.read_bytes())
     broken[len(broken) // 2] ^= 1
     path.write_bytes(broken)
-    text = info_text(path)
+    text = info_text(describe(path))
     assert "base_link <- prism: 1 2.5 3 m, xyzw 0 0 0 1" in text
     assert "rig.yaml: 5 bytes" in text
     assert "skipped: " in text

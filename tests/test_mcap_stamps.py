@@ -82,4 +82,4 @@ def test_the_log_counts_them_and_info_says_so(tmp_path):
     np.testing.assert_array_equal(series.t_ns, np.delete(imu.t_ns, [3, 40, 41]))
     (topic,) = describe(tmp_path / "x.mcap").topics
     assert topic.rate_hz == pytest.approx(100, rel=0.2)
-    assert "3 of 200 messages bear a stamp that cannot be right" in info_text(tmp_path / "x.mcap")
+    assert "3 of 200 messages bear a stamp that cannot be right" in info_text(describe(tmp_path / "x.mcap"))

@@ -2,86 +2,125 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from tbmfg.cli.options import Debug, Log
-from tbmfg.cli.terminal import errors_in_one_line, number, print_table, progress_bar
+from tbmfg.cli.options import Log, RigName, command
+from tbmfg.cli.terminal import Terminal, number
 
 
+@command()
 def info(
     log: Log,
+    out: Terminal,
     allan: Annotated[
         bool, typer.Option("--allan", help="Noise of the IMU by Allan variance over its longest standstill.")
     ] = False,
-    rig: Annotated[
-        str | None, typer.Option(metavar="NAME|FILE", help="Of --allan: else the log's rig, else a guess.")
-    ] = None,
-    debug: Debug = False,
+    rig: Annotated[str | None, RigName] = None,
 ) -> None:
-    """Topics, roles, rates, gaps and clock problems of a log."""
-    with errors_in_one_line(debug):
-        from tbmfg.mcap import info_text
+    """Topics, roles, rates, gaps and clock problems of a log.
 
-        typer.echo(info_text(log))
-        if allan:
-            _print_allan(log, rig)
+    \b
+    Examples:
+      tbmfg info drive.mcap
+      tbmfg info standing.mcap --allan --rig tbm        noise of the IMU beside what the rig says
+      tbmfg info drive.mcap --json | jq .topics[].rate_hz
+    """
+    from tbmfg.mcap import describe, info_text
+
+    with out.progress("reading") as progress:
+        about = describe(log, progress=(lambda share: progress("reading", share)) if progress else None)
+    out.say(info_text(about))
+    noise = _allan(log, rig) if allan else None
+    if noise is not None:
+        _print_allan(out, noise)
+    out.data(asdict(about) | ({"allan": noise} if noise is not None else {}))
 
 
+@command()
 def init(
     log: Log,
+    out: Terminal,
     output: Annotated[str, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    debug: Debug = False,
 ) -> None:
-    """Write a starter rig for a log: what it shows, and what had to be guessed."""
-    with errors_in_one_line(debug):
-        from tbmfg import pipeline
+    """Write a starter rig for a log, and say what was guessed.
 
-        for line in pipeline.init(log, output, force=force):
-            typer.echo(line)
-        typer.echo(f"rig: {output}")
+    \b
+    Examples:
+      tbmfg init drive.mcap -o rig.yaml                 edit what is marked GUESSED, then
+      tbmfg run drive.mcap --rig rig.yaml -o out
+    """
+    from tbmfg import pipeline
+
+    assumed = pipeline.init(log, output, force=force)
+    for line in assumed:
+        out.say(line)
+    out.say(f"rig: {output}")
+    out.data({"rig": output, "assumed": assumed})
 
 
+@command()
 def map_(
     log: Log,
+    out: Terminal,
     trajectory: Annotated[str, typer.Option(metavar="DIR", help="Folder of a result of `tbmfg run`.")],
     output: Annotated[str, typer.Option("--output", "-o", metavar="FILE", help="The .ply or .pcd to write.")],
     lidar: Annotated[str | None, typer.Option(metavar="NAME", help="Which LiDAR of the rig; else the first.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
-    debug: Debug = False,
 ) -> None:
-    """Make the map of a log's LiDAR scans along an estimated trajectory, and a picture of it."""
-    with errors_in_one_line(debug):
-        from tbmfg import mapping
+    """Make the map of a log's scans along a result, and its picture.
 
-        with progress_bar("mapping") as progress:
-            sharp, points = mapping.make(log, trajectory, output, lidar=lidar, force=force, progress=progress)
-        typer.echo(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
-        typer.echo(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
-        typer.echo(f"map: {output}, picture: {Path(output).with_suffix('.png')}")
+    \b
+    Examples:
+      tbmfg map drive.mcap --trajectory out -o map.ply
+    """
+    from tbmfg import mapping
 
-
-def estimators(debug: Debug = False) -> None:
-    """The estimators: what each needs, and where it is from."""
-    with errors_in_one_line(debug):
-        from tbmfg.estimators import ESTIMATORS
-
-        rows = [(name, e.summary, ", ".join(e.needs), e.source) for name, e in ESTIMATORS.items()]
-        print_table(["name", "", "needs", "source"], rows)
+    with out.progress("mapping") as progress:
+        sharp, points = mapping.make(log, trajectory, output, lidar=lidar, force=force, progress=progress)
+    picture = str(Path(output).with_suffix(".png"))
+    out.say(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
+    out.say(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
+    out.say(f"map: {output}, picture: {picture}")
+    out.data({"map": output, "picture": picture, "points": points, **asdict(sharp)})
 
 
-def _print_allan(log: str, rig: str | None) -> None:
+@command()
+def estimators(out: Terminal) -> None:
+    """The estimators: what each needs, and where it is from.
+
+    \b
+    Examples:
+      tbmfg estimators
+      tbmfg estimators --json | jq keys
+    """
+    from tbmfg.estimators import ESTIMATORS
+
+    out.table(
+        ["name", "", "needs", "source"],
+        [(name, e.summary, ", ".join(e.needs), e.source) for name, e in ESTIMATORS.items()],
+    )
+    out.data({name: {"summary": e.summary, "needs": e.needs, "source": e.source} for name, e in ESTIMATORS.items()})
+
+
+def _allan(log: str, rig: str | None) -> dict[str, Any]:
     """What the standing IMU shows of its noise, beside what the rig says of it."""
     from tbmfg import pipeline
     from tbmfg.inertial.allan import against_rig
 
     found, imu = pipeline.allan(log, rig)
-    typer.echo(f"\nAllan variance, standing from {found.start_s:.1f} to {found.end_s:.1f} s")
+    noise = {name: {"found": value, "rig": said} for name, value, said in against_rig(found, imu)}
+    return {"start_s": found.start_s, "end_s": found.end_s, "noise": noise}
+
+
+def _print_allan(out: Terminal, allan: dict[str, Any]) -> None:
+    out.say(f"\nAllan variance, standing from {allan['start_s']:.1f} to {allan['end_s']:.1f} s")
     rows = [
-        (name, "not seen" if value is None else number(value), number(said))
-        for name, value, said in against_rig(found, imu)
+        (name, "not seen" if one["found"] is None else number(one["found"]), number(one["rig"]))
+        for name, one in allan["noise"].items()
     ]
-    print_table(["", "found", "rig"], rows, justify="right")
+    out.table(["", "found", "rig"], rows, justify="right")

@@ -9,18 +9,57 @@ from typing import Annotated, Any
 
 import typer
 
+from tbmfg.cli.terminal import Level, Terminal
+
+
+def estimator_names(typed: str) -> list[str]:
+    """For completion: names after the last comma."""
+    from tbmfg.estimators import ESTIMATORS
+
+    before, comma, last = typed.rpartition(",")
+    return [f"{before}{comma}{name}" for name in ESTIMATORS if name.startswith(last)]
+
+
+def rig_names(typed: str) -> list[str]:
+    """For completion: the shipped rigs; the shell itself completes files."""
+    from tbmfg.rig import shipped
+
+    return [name for name in shipped() if name.startswith(typed)]
+
+
 Log = Annotated[str, typer.Argument(metavar="LOG", help="An .mcap file or a rosbag2 folder.", show_default=False)]
 Output = Annotated[str, typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.")]
-Names = Annotated[str, typer.Option(metavar="A,B,...", help="Names from `tbmfg estimators`.")]
+Name = Annotated[
+    str, typer.Option(metavar="NAME", help="A name from `tbmfg estimators`.", autocompletion=estimator_names)
+]
+Names = Annotated[
+    str, typer.Option(metavar="A,B,...", help="Names from `tbmfg estimators`.", autocompletion=estimator_names)
+]
+RigName = typer.Option(
+    metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess.", autocompletion=rig_names
+)
 Force = Annotated[bool, typer.Option("--force", help="Replace existing results.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def terminal(
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
+    level: Annotated[
+        Level,
+        typer.Option("--log-level", help="info: also every stage and its time; debug: also tracebacks."),
+    ] = Level.warning,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; as --log-level debug.")
+    ] = False,
+) -> Terminal:
+    """What every command takes: how much is said, and to whom."""
+    if quiet and debug:
+        raise typer.BadParameter("--quiet and --debug contradict each other", param_hint="--quiet")
+    return Terminal(Level.error if quiet else Level.debug if debug else level, json)
 
 
 def selection(
-    rig: Annotated[
-        str | None,
-        typer.Option(metavar="NAME|FILE", help="A shipped rig or a rig.yaml; else the log's, else a guess."),
-    ] = None,
+    rig: Annotated[str | None, RigName] = None,
     truth: Annotated[
         str,
         typer.Option(metavar="auto|none|TOPIC|FILE", help="Reference to compare with; auto: the rig's, or by name."),
@@ -55,25 +94,39 @@ def selection(
     }
 
 
-def with_selection(command: Callable[..., None]) -> Callable[..., None]:
-    """Give ``command`` the options of :func:`selection`, which it gets parsed as ``options``."""
-    shared = inspect.signature(selection, eval_str=True).parameters
-    own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name != "options"]
+def command(**groups: Callable[..., Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of functions, and turn what it raises into a line.
 
-    @functools.wraps(command)
-    def wrapper(**given: Any) -> None:
-        command(options=selection(**{name: given.pop(name) for name in shared}), **given)
+    A parameter of the command that is named here gets what its function makes of its options; ``out`` is the
+    :class:`Terminal` of every command.
+    """
+    groups = {**groups, "out": terminal}
 
-    parameters = sorted([*own, *shared.values()], key=lambda p: p.default is not p.empty)  # required ones first
-    wrapper.__signature__ = inspect.Signature(parameters)
-    wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
-    return wrapper
+    def decorate(body: Callable[..., None]) -> Callable[..., None]:
+        shared = {name: inspect.signature(made, eval_str=True).parameters for name, made in groups.items()}
+        own = [p for p in inspect.signature(body, eval_str=True).parameters.values() if p.name not in groups]
+
+        @functools.wraps(body)
+        def wrapper(**given: Any) -> None:
+            made = {name: groups[name](**{key: given.pop(key) for key in keys}) for name, keys in shared.items()}
+            with made["out"].errors():
+                body(**made, **given)
+
+        options = [p for parameters in shared.values() for p in parameters.values()]
+        parameters = sorted([*own, *options], key=lambda p: p.default is not p.empty)  # required ones first
+        wrapper.__signature__ = inspect.Signature(parameters)
+        wrapper.__annotations__ = {p.name: p.annotation for p in parameters}
+        return wrapper
+
+    return decorate
 
 
 def known(estimators: list[str], hint: str) -> None:
     """Refuse a name that no estimator has."""
     from tbmfg.estimators import ESTIMATORS
 
+    if not estimators:
+        raise typer.BadParameter("names none; see `tbmfg estimators`", param_hint=hint)
     for name in estimators:
         if name not in ESTIMATORS:
             raise typer.BadParameter(f"no {name!r}; there are {', '.join(ESTIMATORS)}", param_hint=hint)

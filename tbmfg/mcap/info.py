@@ -190,9 +190,8 @@ def unit_problems(series: Series | None) -> tuple[str, ...]:
     return ()
 
 
-def info_text(path: str | os.PathLike, *, progress: Callable[[float], None] | None = None) -> str:
+def info_text(about: Description) -> str:
     """The description of a recording as plain text."""
-    about = describe(path, progress=progress)
     lines = [
         about.path,
         f"{sum(topic.messages for topic in about.topics)} messages on {len(about.topics)} topics, "
