@@ -71,7 +71,6 @@ MAGNETIC_TEST = {
 MAGNETIC_REDUCTION = 59.6
 
 SURVEY_SD_M = 0.01
-REPORTED_S = 1.0  # magnetometer intervals closer than this are one stretch
 CLEAR = 5.0  # sds from which a spike has to be found
 BOUNDS = {"fault_start": (None, 1.0), "fault_end": (None, 1.0), "spikes_found": (95.0, None)}
 
@@ -229,18 +228,15 @@ def fault_errors(simulation: Simulation, result: Result, truth: Truth) -> Metric
 
 
 def reported(simulation: Simulation, result: Result, start_s: float, end_s: float) -> tuple[float, float]:
-    """The stretch of the magnetometer that a result names and that covers most of a fault; of no length at the end of
-    the log where it names none."""
-    named = sorted(
+    """Ends of the first and the last stretch of the magnetometer that a result names within a fault: its effect on yaw
+    may pass zero on the way, where nothing is wrong. Of no length at the end of the log where it names none."""
+    named = [
         ((part.start_ns - simulation.start_ns) * 1e-9, (part.end_ns - simulation.start_ns) * 1e-9)
         for part in result.intervals
         if part.sensor == "magnetometer"
-    )
-    stretches: list[tuple[float, float]] = []
-    for first, last in named:
-        if stretches and first - stretches[-1][1] < REPORTED_S:
-            stretches[-1] = stretches[-1][0], max(last, stretches[-1][1])
-        else:
-            stretches.append((first, last))
-    never = (result.trajectory.t_ns[-1] - simulation.start_ns) * 1e-9
-    return max(stretches, key=lambda s: min(s[1], end_s) - max(s[0], start_s), default=(never, never))
+    ]
+    within = [(first, last) for first, last in named if first < end_s and last > start_s]
+    if not within:
+        never = (result.trajectory.t_ns[-1] - simulation.start_ns) * 1e-9
+        return never, never
+    return min(first for first, _ in within), max(last for _, last in within)
