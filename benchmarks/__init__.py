@@ -19,6 +19,7 @@ BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "attitude": "benchmarks.attitude",
     "gyrocompass": "benchmarks.gyrocompass",
+    "reckoning": "benchmarks.reckoning",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",

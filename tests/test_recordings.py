@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks import attitude
+from benchmarks import attitude, reckoning
 from tbmfg.mcap import read_log
 from tbmfg.pipeline import compare, run
 from tbmfg.prepare import prepare
@@ -62,3 +62,15 @@ def test_hand_held_unit_in_a_disturbed_field():
     assert error["batch", "inclination"] <= 0.5
     assert error["batch", "nees"] <= 5.0  # per dof; scale factors and misalignment are no white noise
     assert error["ins", "total"] <= 2.2
+
+
+@pytest.mark.parametrize("name", ["comma_ex1", "husky"])
+def test_without_positions_smoothing_is_not_worse_than_dead_reckoning(name):
+    """Wheels and gyro, no heading and no rest at the start: a gyro bias of a degree per second bends the whole path."""
+    folders = {"comma_ex1": "comma2k19_wheel_imu", "husky": "husky_odom_imu_gps"}
+    source = data("").parent / folders[name] / f"{name}.npz"
+    rows = reckoning.one_drive(name.partition("_")[0], source, ["batch"], [])
+    share = {(row.estimator, row.metric): row.mean for row in rows}
+    for metric in ("end", "rms"):
+        assert share["batch", metric] < 1.05 * share["dead reckoning", metric]
+        assert 0.1 < share["dead reckoning", metric] < 5.0

@@ -186,3 +186,14 @@ def test_what_a_filter_needs_is_asked_for():
                 estimate(name, lacking)
             assert "\n" not in str(caught.value)
         assert unmet("shearer-sins", lacking) is None
+
+
+def test_a_bias_that_bends_the_whole_path_is_found_all_the_same():
+    """Without rest, heading or position a degree per second turns the path by 85 degrees: far beyond where a position
+    corrected by its tangent still fits."""
+    settings = ("sensors.imu.gyro_bias_sd_dps=1", "sensors.imu.acc_bias_sd_mps2=0.2", "initial.tilt_sd_deg=5")
+    simulation = datasets.make("shearer-cut", seed=4, duration=85.0, settings=settings)
+    result = estimate("batch", prepare(log_of(simulation.log_series), simulation.rig, without=("magnetometer",)))
+    assert not [line for line in result.warnings if "did not converge" in line]
+    scale = result.calibration["odometer_scale"]
+    assert abs(scale.value - simulation.drawn["odometer"]["scale"]) < 3.0 * scale.sd

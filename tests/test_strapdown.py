@@ -11,6 +11,7 @@ from tbmfg import earth
 from tbmfg.geometry import exp_so3, log_so3, skew
 from tbmfg.inertial.steps import compensate, make_steps
 from tbmfg.inertial.strapdown import (
+    correct_path,
     correct_state,
     correct_states,
     difference,
@@ -347,3 +348,29 @@ def test_difference_undoes_a_correction():
     x0 = np.tile(np.append(X0, [0.4, -0.2]), (5, 1))
     d = rng.standard_normal((5, 17))
     assert_allclose(difference(correct_states(x0, d), x0), d, atol=1e-13)
+
+
+# ---- corrections of a whole path ----
+
+
+def test_a_path_corrected_along_itself_is_corrected_alike_to_first_order():
+    rng = np.random.default_rng(8)
+    x = correct_states(np.tile(X0, (12, 1)), rng.standard_normal((12, 15)))
+    d = rng.standard_normal((12, 15))
+    apart = [np.abs(difference(correct_path(x, size * d), correct_states(x, size * d))).max() for size in (1e-3, 1e-4)]
+    assert apart[0] < 1e-3
+    assert apart[1] == pytest.approx(apart[0] / 100, rel=0.05)  # second order
+
+
+def test_a_path_turned_about_its_start_keeps_its_form():
+    """Turning all states about the vertical is one correction, however far, and no step changes its length."""
+    rng = np.random.default_rng(3)
+    x = correct_states(np.tile(X0, (12, 1)), rng.standard_normal((12, 15)))
+    turn = 1.5 * np.array([0.0, 0.0, 1.0])
+    d = np.zeros((12, 15))
+    d[:, :3] = np.einsum("nji,j->ni", x[:, :9].reshape(-1, 3, 3), turn)
+    d[:, 3:6], d[:, 6:9] = np.cross(turn, x[:, 9:12] - x[0, 9:12]), np.cross(turn, x[:, 12:15])
+    turned, Z = correct_path(x, d), exp_so3(turn)
+    assert_allclose(turned[:, 9:12], x[0, 9:12] + (x[:, 9:12] - x[0, 9:12]) @ Z.T, atol=1e-13)
+    assert_allclose(turned[:, 12:15], x[:, 12:15] @ Z.T, atol=1e-14)
+    assert_allclose(turned[:, :9].reshape(-1, 3, 3), Z @ x[:, :9].reshape(-1, 3, 3), atol=1e-14)

@@ -180,6 +180,23 @@ def correct_states(x: np.ndarray, d: np.ndarray) -> np.ndarray:
     return out
 
 
+def correct_path(x: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """``correct_states`` to first order in ``d`` (n, 15 + e), along the path (n, 21 + e) from its first state on: the
+    velocities and the steps from state to state change in b and turn with it, so that a path bends and keeps its form
+    where additive positions would tear it."""
+    out = correct_states(x, d)
+    R, R_new = (states[:, :9].reshape(-1, 3, 3) for states in (x, out))
+
+    def turned(vector_n: np.ndarray, change_n: np.ndarray, k: slice) -> np.ndarray:
+        vector_b, change_b = (np.einsum("nji,nj->ni", R[k], v) for v in (vector_n, change_n))
+        return np.einsum("nij,nj->ni", R_new[k], vector_b + change_b - np.cross(d[k, :3], vector_b))
+
+    steps = turned(np.diff(x[:, 9:12], axis=0), np.diff(d[:, 3:6], axis=0), slice(None, -1))
+    out[1:, 9:12] = out[0, 9:12] + np.cumsum(steps, axis=0)
+    out[:, 12:15] = turned(x[:, 12:15], d[:, 6:9], slice(None))
+    return out
+
+
 @njit(cache=True)
 def log_rotation(R: np.ndarray) -> np.ndarray:
     """Log of one rotation matrix (3, 3) -> (3,), norm at most pi; by the quaternion's largest part (Shepperd 1978)."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tbmfg.errors import EstimationError
-from tbmfg.inertial.strapdown import correct_states
+from tbmfg.inertial.strapdown import correct_path, correct_states
 from tbmfg.problem import Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother import graph, losses
@@ -19,6 +19,8 @@ from tbmfg.timeseries import Floats
 MAX_ITERATIONS = 30
 STAGE_ITERATIONS = 2  # at each loss on the way to the truncated square
 OFFSET_REACH_S = 0.02  # a clock offset beyond the one found by ``prepare``: the prism's model is first order in it
+# a step that does not pay is tried along the path, which reaches farther where nothing holds the heading, and shorter
+TRIES = ((correct_states, 1.0), (correct_path, 1.0), (correct_path, 0.3))
 CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
 
 
@@ -77,13 +79,17 @@ class _Descent:
             chain = eliminate(self.blocks + _damping(self.blocks, damping, n, d, m), n, d, m)
             _check(problem, chain)
             dx, dc = chain.solve()
-            candidate = States(correct_states(self.states.x, dx), self.states.c.copy())
-            candidate.c[free] += dc
-            candidate.c[self.clocks] = np.clip(candidate.c[self.clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
-            blocks, nis, new_cost = _linearise(problem, self.imu, candidate, free, mu)
+            for correct, part in TRIES:
+                c = self.states.c.copy()
+                c[free] += part * dc
+                c[self.clocks] = np.clip(c[self.clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
+                candidate = States(correct(self.states.x, part * dx), c)
+                blocks, nis, new_cost = _linearise(problem, self.imu, candidate, free, mu)
+                if paid := bool(np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9):
+                    break
             if self.progress is not None:
                 self.progress(self.iterations / (self.iterations + 3))
-            if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9:
+            if paid:
                 converged = damping < 1e-6 and cost - new_cost < CONVERGED * 1e-3 * (1.0 + cost)
                 self.states, self.blocks, self.nis, cost = candidate, blocks, nis, new_cost
                 if converged:
