@@ -20,6 +20,7 @@ BENCHMARKS = {
     "attitude": "benchmarks.attitude",
     "gyrocompass": "benchmarks.gyrocompass",
     "reckoning": "benchmarks.reckoning",
+    "height": "benchmarks.height",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy.special import ndtr, ndtri
 
 from tbmfg.geometry import FLIP, rotation_z, wrap
 from tbmfg.measure import Samples, nearest
@@ -26,6 +27,7 @@ NORMAL, TROUBLESHOOT, STOP = 0, 1, 2
 LEVELS = ("normal", "troubleshoot", "stop")
 NO_DEVIATION, ABNORMAL = 0, -1  # beside the case numbers 1..32
 SPOT_GAP_S = 2.0  # without a spot for longer nothing is said
+OFTEN = 0.01  # share of the time beyond a tolerance by the estimate's own error, from which that is said
 
 # Table 1: signs of the spot (a, b) -> signs of (beta, alpha) -> case of Fig. 8. What is not here is abnormal.
 CASES = {
@@ -117,6 +119,27 @@ def spots_at(spots: Samples, sensor: Laser, keyframes_s: Floats) -> tuple[np.nda
     return seen, np.column_stack([np.bincount(k, weights=ab[:, axis])[seen] / count[seen] for axis in (0, 1)])
 
 
+@dataclass(frozen=True, slots=True)
+class Deviated:
+    """Where a spot was seen: ``t_s`` (n,), the mean ``spot`` (n, 2) m, ``angles`` (n, 3) rad of roll, pitch and yaw,
+    and the ``state`` that they make."""
+
+    t_s: Floats
+    spot: Floats
+    angles: Floats
+    state: Classified
+
+
+def deviation(trajectory: Trajectory, spots: Samples, sensor: Laser, rule: Deviation, t0_ns: int) -> Deviated:
+    """The dual coordinates at a trajectory's keyframes, times in s from ``t0_ns``."""
+    t_all = seconds(trajectory.t_ns, t0_ns)
+    seen, spot = spots_at(spots, sensor, t_all)
+    t_s, angles = t_all[seen], angles_of(trajectory.rotations()[seen], rule.reference)
+    tolerance = np.array([rule.spot_tolerance] * 2 + [rule.angle_tolerance] * 2 + [rule.yaw_tolerance])
+    values = np.column_stack([spot, angles[:, [1, 0, 2]]])
+    return Deviated(t_s, spot, angles, classify(settled_signs(values, t_s, tolerance, rule.release, rule.window)))
+
+
 def timeline(trajectory: Trajectory, spots: Samples, sensor: Laser, rule: Deviation, t0_ns: int) -> dict[str, Any]:
     """The deviation over a trajectory's keyframes: seconds spent in each level, and the intervals of equal state.
 
@@ -124,13 +147,8 @@ def timeline(trajectory: Trajectory, spots: Samples, sensor: Laser, rule: Deviat
     of spot (a, b) in mm and of roll, pitch, yaw in degrees, in the paper's axes. It ends where the next begins, or at
     the last keyframe before a time without spots.
     """
-    t_all = seconds(trajectory.t_ns, t0_ns)
-    seen, spot = spots_at(spots, sensor, t_all)
-    t_s, angles = t_all[seen], angles_of(trajectory.rotations()[seen], rule.reference)
-    tolerance = np.array([rule.spot_tolerance] * 2 + [rule.angle_tolerance] * 2 + [rule.yaw_tolerance])
-    values = np.column_stack([spot, angles[:, [1, 0, 2]]])
-    state = classify(settled_signs(values, t_s, tolerance, rule.release, rule.window))
-
+    found = deviation(trajectory, spots, sensor, rule, t0_ns)
+    t_s, spot, angles, state = found.t_s, found.spot, found.angles, found.state
     lost = np.diff(t_s) > SPOT_GAP_S
     told = np.column_stack([state.case, state.level, state.signs[:, 2:4]])
     changed = (np.diff(told, axis=0) != 0).any(axis=1)
@@ -152,3 +170,20 @@ def timeline(trajectory: Trajectory, spots: Samples, sensor: Laser, rule: Deviat
             }
         )
     return {"level_s": spent, "timeline": intervals}
+
+
+def vague(trajectory: Trajectory, rule: Deviation) -> list[str]:
+    """Angles that are known too poorly for their tolerances, so that a machine without deviation would often seem to
+    have one. Says nothing of a trajectory without covariance."""
+    sd = np.median(np.sqrt(np.diagonal(trajectory.cov[:, :3, :3], axis1=1, axis2=2)), axis=0)  # of a machine near level
+    lines = []
+    for what, said, key in zip(("roll", "pitch", "yaw"), sd, ("angle", "angle", "yaw"), strict=True):
+        tolerance = getattr(rule, f"{key}_tolerance")
+        outside = 2.0 * ndtr(-tolerance / said) if said > 0 else 0.0
+        if outside > OFTEN:
+            lines.append(
+                f"deviation: {what} is known to {np.rad2deg(said):.2g} deg (1 sd), its tolerance is "
+                f"{np.rad2deg(tolerance):.2g} deg: without any deviation it would be outside {outside:.0%} of the time"
+                f"; set deviation.{key}_tolerance_deg to {np.rad2deg(-said * ndtri(OFTEN / 2)):.2g} or more"
+            )
+    return lines

@@ -68,7 +68,8 @@ class Session:
         result = estimate(name, self.prepared, progress=progress)
         wall_s = self.shared_s + time.perf_counter() - started
 
-        result.warnings = list(dict.fromkeys([*self.assumed, *self.prepared.warnings, *result.warnings]))
+        deviation, vague = self._deviation(result)
+        result.warnings = list(dict.fromkeys([*self.assumed, *self.prepared.warnings, *result.warnings, *vague]))
         span_ns = int(result.trajectory.t_ns[-1] - result.trajectory.t_ns[0])
         summary: dict[str, Any] = {
             "tbmfg_version": __version__,
@@ -84,7 +85,7 @@ class Session:
             "realtime_factor": span_ns / NS / wall_s,
             "peak_rss_mb": peak_rss_mb(),
             **summarise(result, self.prepared.t0_ns),
-            **self._deviation(result),
+            **deviation,
             "metrics": None,
         }
         poses = self.truth(result)
@@ -145,16 +146,18 @@ class Session:
             assumed=self.assumed,
         )
 
-    def _deviation(self, result: Result) -> dict[str, Any]:
-        """What the dual-coordinate method says of a machine with a laser, {"deviation": ...}; nothing for others."""
+    def _deviation(self, result: Result) -> tuple[dict[str, Any], list[str]]:
+        """What the dual-coordinate method says of a machine with a laser, {"deviation": ...}, nothing of others; and
+        which of its angles are known too poorly for that."""
         lasers = self.prepared.rig.of_kind("laser")
         name = next((name for name in lasers if name in self.prepared.samples), None)
         if name is None:
-            return {}
-        from tbmfg.dual import timeline
+            return {}, []
+        from tbmfg.dual import timeline, vague
 
         spots, rule = self.prepared.samples[name], self.prepared.rig.deviation
-        return {"deviation": timeline(result.trajectory, spots, lasers[name], rule, self.prepared.t0_ns)}
+        told = timeline(result.trajectory, spots, lasers[name], rule, self.prepared.t0_ns)
+        return {"deviation": told}, vague(result.trajectory, rule)
 
 
 def open_session(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tbmfg.dual import LEVELS, STOP, angles_of, classify, direction, settled_signs, timeline
+from tbmfg.dual import LEVELS, STOP, angles_of, classify, direction, settled_signs, timeline, vague
 from tbmfg.mcap import write_log
 from tbmfg.measure import Samples
 from tbmfg.pipeline import run
@@ -218,6 +218,16 @@ def test_any_estimators_summary_has_the_timeline_of_a_machine_with_a_laser(tmp_p
     assert_allclose(intervals[0]["spot_mm"], [2.0, 0.0], atol=1e-3)
     simulation.write(tmp_path / "without.mcap")
     assert "deviation" not in run(tmp_path / "without.mcap", estimator="ins")
+
+
+def test_an_angle_known_too_poorly_for_its_tolerance_is_said():
+    """0.1 deg is 2.05 sds of 0.0487 deg: outside in 4 % of the time; in 1 % it would be outside 2.576 sds."""
+    trajectory = standing(np.zeros((5, 3)), np.arange(5.0))
+    trajectory.cov[:, 2, 2] = np.deg2rad(0.0487) ** 2
+    assert vague(trajectory, RULE) == []
+    [line] = vague(trajectory, RULE.model_copy(update={"yaw_tolerance_deg": 0.1}))
+    assert line.startswith("deviation: yaw is known to 0.049 deg (1 sd), its tolerance is 0.1 deg")
+    assert line.endswith("outside 4% of the time; set deviation.yaw_tolerance_deg to 0.13 or more")
 
 
 def test_bands_are_the_rigs():

@@ -1,10 +1,12 @@
 """Real recordings, through the whole pipeline: what was measured with them must not get lost again."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks import attitude, reckoning
+from benchmarks import attitude, height, reckoning
 from tbmfg.mcap import read_log
 from tbmfg.pipeline import compare, run
 from tbmfg.prepare import prepare
@@ -74,3 +76,12 @@ def test_without_positions_smoothing_is_not_worse_than_dead_reckoning(name):
     for metric in ("end", "rms"):
         assert share["batch", metric] < 1.05 * share["dead reckoning", metric]
         assert 0.1 < share["dead reckoning", metric] < 5.0
+
+
+def test_a_phones_barometer_tells_height_as_its_satellite_fixes_do():
+    """Fixes are of metres: smoothing cannot come closer to them than the readings do, and must not lose them."""
+    source = data("").parent / "phone_baro_mag_gps" / "eth_2023-03-17.npz"
+    given = SimpleNamespace(source=source, estimators="batch", assignments=[])
+    found = {(row.estimator, row.metric): row.mean for row in height.measure(given)}
+    assert found["batch", "difference"] < 1.02 * found["barometer", "difference"] < 1.5
+    assert found["batch", "correlation"] > 0.95

@@ -4,6 +4,9 @@ RMS over each log: pitch, roll and yaw (Table 2), displacement of the detector a
 speed of the cage (Tables 3 and 4). Of ``batch`` also ``.._true``, the RMS of the truth itself, which is the error of a
 constant, and ``.._sd``, what its covariance says of its error.
 
+classified             of the time that the dual coordinates' case and level are those of the true angles and spot, and
+false_stop             of the time that they say stop and the true ones do not; both by the measured spot
+
 .. over sbm-cfekf      the mean over that of the paper's proposed filter: what its tables can be compared by
 .. in order            pairs of the three filters that stand as in the paper
 .. over best filter    the mean over that of the best of the three. Its bound is what a smoother should reach where
@@ -20,6 +23,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
@@ -32,7 +36,7 @@ from benchmarks.rows import Row
 if TYPE_CHECKING:
     from datasets.simulate import Simulation
     from tbmfg.problem import Problem
-    from tbmfg.state import Result, Truth
+    from tbmfg.state import Result, Trajectory, Truth
     from tbmfg.timeseries import Floats
 
 THREE = CF, EKF, CFEKF = "sbm-cf", "sbm-ekf", "sbm-cfekf"
@@ -166,7 +170,30 @@ def errors(simulation: Simulation, result: Result, truth: Truth) -> Metrics:
         found |= {f"{axis}_true": true[:, k] for axis, k in (("pitch", 1), ("roll", 2), ("yaw", 0))}
         found |= {f"{metric}_sd": sd for metric, sd in sds(result, detector).items()}
     asked = {name: name.partition("_")[0] for name in found if name.partition("_")[0] in MEASURED[simulation.name]}
-    return {name: (float(np.sqrt(np.mean(found[name] ** 2))), UNITS[metric]) for name, metric in asked.items()}
+    rms = {name: (float(np.sqrt(np.mean(found[name] ** 2))), UNITS[metric]) for name, metric in asked.items()}
+    return rms | dual_coordinates(simulation, path, truth)
+
+
+def dual_coordinates(simulation: Simulation, path: Trajectory, truth: Truth) -> Metrics:
+    """How well a trajectory tells the machine's state; nothing of one without a laser."""
+    from tbmfg.dual import STOP, deviation
+    from tbmfg.measure import Samples
+    from tbmfg.timeseries import seconds
+
+    if not (lasers := simulation.rig.of_kind("laser")):
+        return {}
+    [(name, laser)] = lasers.items()
+    measured = next(series for series in simulation.log_series if series.topic == laser.topic)
+    states = []
+    for series, at in ((measured, path), (simulation.clean[name], replace(path, quat_xyzw=truth.quat_xyzw))):
+        spots = Samples(name, seconds(series.t_ns, path.t_ns[0]), series["point"][:, :2])
+        states.append(deviation(at, spots, laser, simulation.rig.deviation, path.t_ns[0]))
+    found, true = states
+    both = np.isin(true.t_s, found.t_s)
+    case, level = true.state.case[both], true.state.level[both]
+    right = (found.state.case == case) & (found.state.level == level)
+    stop = (found.state.level == STOP) & (level != STOP)
+    return {"classified": (100.0 * float(right.mean()), "%"), "false_stop": (100.0 * float(stop.mean()), "%")}
 
 
 def sds(result: Result, detector: Floats) -> dict[str, Floats]:
