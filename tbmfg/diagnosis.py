@@ -27,8 +27,8 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
             lines += _depth(problem, path, sensor, what, float(sd[k]))
         elif sd[k] > UNOBSERVED * parameters.sd[k]:
             lines.append(
-                f"{parameters.names[k]} is not observable on this log: its sd stays {sd[k]:.3g} of the prior's "
-                f"{parameters.sd[k]:.3g}; {_motion(path, what)}"
+                f"{parameters.names[k]} is not observable on this log: its sd stays "
+                f"{sd[k] / parameters.sd[k]:.0%} of the prior's; {_motion(path, what)}"
             )
     return lines
 

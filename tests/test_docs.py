@@ -3,6 +3,7 @@
 import re
 import runpy
 import sys
+import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -46,8 +47,8 @@ def as_modules(page: Path, monkeypatch) -> list[str]:
         exec(code, module.__dict__)
     points = []
     for text in blocks(page, "toml"):
-        group, name, value = re.fullmatch(r'\[project\.entry-points\."([\w.]+)"\]\n(\w+) = "(.*)"\n', text).groups()
-        points.append(EntryPoint(name, value, group))
+        groups = tomllib.loads(text)["project"].get("entry-points", {})
+        points += [EntryPoint(*item, group) for group, items in groups.items() for item in items.items()]
     monkeypatch.setattr("tbmfg.registry.entry_points", lambda group: [p for p in points if p.group == group])
     return rest
 

@@ -121,10 +121,12 @@ def test_the_layout_asks_for_what_a_result_holds(tmp_path):
 
 # ---- evo ----
 
-EVO = shutil.which("evo_ape") or shutil.which("evo_ape", path=str(Path(sys.executable).parent))
+
+def evo(tool: str) -> str | None:
+    return shutil.which(tool) or shutil.which(tool, path=str(Path(sys.executable).parent))
 
 
-@pytest.mark.skipif(EVO is None, reason="no evo to compare with")
+@pytest.mark.skipif(evo("evo_ape") is None, reason="no evo to compare with")
 @pytest.mark.parametrize("kind", ["tum", "mcap"])
 def test_evo_finds_our_ape(tmp_path, kind):
     """Aligned as ours is; both files are exact to a nanometre, so the two agree far below a micrometre."""
@@ -138,7 +140,7 @@ def test_evo_finds_our_ape(tmp_path, kind):
         write_log(tmp_path / "log.mcap", [true])
         write_into(tmp_path / "log.mcap", tmp_path / "both.mcap", path, "/truth/pose")
         files = ["both.mcap", "/truth/pose", "/tbmfg/odometry"]
-    command = [EVO, kind, *files, "--align", "--save_results", "ape.zip", "--no_warnings"]
+    command = [evo("evo_ape"), kind, *files, "--align", "--save_results", "ape.zip", "--no_warnings"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
     with zipfile.ZipFile(tmp_path / "ape.zip") as results:
         theirs = json.loads(results.read("stats.json"))
@@ -146,6 +148,27 @@ def test_evo_finds_our_ape(tmp_path, kind):
     assert theirs["rmse"] == pytest.approx(ours["ape_rms_m"], abs=1e-6)
     assert theirs["max"] == pytest.approx(ours["ape_max_m"], abs=1e-6)
     assert ours["ape_rms_m"] > 0.01
+
+
+@pytest.mark.skipif(evo("evo_traj") is None, reason="no evo to read with")
+@pytest.mark.parametrize("kind", ["tum", "mcap"])
+def test_evo_finds_our_poses_whole(tmp_path, kind):
+    path = trajectory()
+    if kind == "tum":
+        write_tum(tmp_path / "ours.tum", path.t_ns, path.position_n, path.quat_xyzw)
+        files = ["ours.tum"]
+    else:
+        write_trajectory(tmp_path / "result.mcap", path, diagnostics={"estimator": "batch"})
+        files = ["result.mcap", "/tbmfg/odometry"]
+    command = [evo("evo_traj"), kind, *files, "--full_check", "--no_warnings"]
+    told = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True, timeout=120).stdout
+    found = dict(re.findall(r"^\t([^\t]+)\t(.+)$", told, re.MULTILINE))
+    assert int(found["nr. of poses"]) == len(path)
+    steps = np.linalg.norm(np.diff(path.position_n, axis=0), axis=1)
+    assert float(found["path length (m)"]) == pytest.approx(steps.sum(), abs=1e-6)
+    assert float(found["t_start (s)"]) == pytest.approx(path.t_ns[0] * 1e-9, abs=1e-6)
+    checks = ("SE(3) conform", "array shapes", "nr. of stamps", "quaternions", "timestamps")
+    assert [found[check] for check in checks] == ["yes", "ok", "ok", "ok", "ok"]
 
 
 # ---- poses back into a copy of the log ----

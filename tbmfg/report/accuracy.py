@@ -19,6 +19,7 @@ from tbmfg.report.panels import (
     add_line,
     axis_name,
     labelled,
+    log_ticks,
     point_of_truth,
     stacked,
 )
@@ -26,7 +27,7 @@ from tbmfg.report.thin import packed
 from tbmfg.state import POS, Innovations
 from tbmfg.timeseries import Floats
 
-NEAR = 4.0  # of the best estimate's reach, what the errors of all are shown in
+NEAR = 2.5  # of the best estimate's reach, what the errors of all are shown in
 NIS_STRETCHES = 200
 GATED_DRAWN = 400  # of one sensor and estimator
 
@@ -74,13 +75,18 @@ def how_sure(report: Report, pen: dict[str, Pen]) -> Figure:
         "Its own standard deviations (1 sigma): of the position in space, of the heading, and of the tilt.",
     )
     titles = ["position, mm", "heading, deg", "tilt, deg"]
-    figure.layout = stacked(titles, TIME, type="log", exponentformat="none", minexponent=4)
+    figure.layout = stacked(titles, TIME)
+    low, high = np.full(len(titles), np.inf), np.zeros(len(titles))
     for track in reversed(report.tracks):
         t_s = (track.path.t_ns - report.t0_ns) * 1e-9
         turns = np.rad2deg(track.rotation_sd())
         position = 1e3 * np.linalg.norm(track.position_sd(), axis=1)
         for panel, y in enumerate([position, turns[:, 2], np.linalg.norm(turns[:, :2], axis=1)]):
-            add_line(figure, pen[track.label], t_s, np.where(y > 0, y, np.nan), panel, shown=panel == 0)
+            known = np.isfinite(y) & (y > 0)
+            low[panel], high[panel] = min(low[panel], y[known].min(initial=np.inf)), y[known].max(initial=high[panel])
+            add_line(figure, pen[track.label], t_s, np.where(known, y, np.nan), panel, shown=panel == 0)
+    for panel in np.flatnonzero(high > 0):
+        figure.layout[f"yaxis{panel + 1 if panel else ''}"] |= log_ticks(low[panel], high[panel])
     return figure
 
 

@@ -73,6 +73,11 @@ class Report:
         self.innovations[name] = result.innovations
         self.truth = self.truth or truth
 
+    def span_s(self) -> tuple[float, float]:
+        """Between which times there are estimates."""
+        ends = np.array([track.path.t_ns[[0, -1]] for track in self.tracks])
+        return float(ends[:, 0].min() - self.t0_ns) * 1e-9, float(ends[:, 1].max() - self.t0_ns) * 1e-9
+
     def html(self) -> str:
         """The page."""
         from tbmfg.report.page import page

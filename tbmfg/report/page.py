@@ -11,7 +11,7 @@ from tbmfg import __version__
 from tbmfg.comparison import not_run, ran
 from tbmfg.report import accuracy, paths, tables, timeline
 from tbmfg.report.content import Report
-from tbmfg.report.panels import Figure, Pen, pens
+from tbmfg.report.panels import TIME, Figure, Pen, pens
 from tbmfg.report.words import findings
 from tbmfg.timeseries import NS
 
@@ -37,6 +37,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .8rem; backgrou
 .wide { overflow-x: auto; }
 .note, figcaption { color: #555; font-size: .85rem; }
 .grave { border-left: 5px solid #D55E00; padding-left: .8rem; }
+.stacked td small { display: block; }
 .swatch { display: inline-block; width: 1.6rem; margin-right: .4rem; vertical-align: middle; }
 figure { margin: 0; }
 @page { size: A4; margin: 12mm; }
@@ -52,6 +53,7 @@ figure { margin: 0; }
 # One figure after the other, so that the page answers meanwhile, and the one in space when it is scrolled to: without a
 # graphics card it takes long. Nothing is ever sent anywhere.
 SCRIPT = """
+const unseen = new Map();
 const waiting = JSON.parse(document.getElementById("figures").textContent);
 const options = {responsive: true, displaylogo: false, plotlyServerURL: "",
                  modeBarButtonsToRemove: ["sendChartToCloud", "select2d", "lasso2d"]};
@@ -60,21 +62,24 @@ function draw(k) {
   const plot = document.getElementById("figure" + k), {data, layout} = waiting[k];
   const next = () => setTimeout(draw, 0, k + 1);
   if (!layout.scene) { Plotly.newPlot(plot, data, layout, options).then(next); return; }
-  const watch = new IntersectionObserver(seen => {
-    if (!seen.some(one => one.isIntersecting)) return;
-    watch.disconnect();
-    Plotly.newPlot(plot, data, layout, options);
-  });
+  unseen.set(plot, () => { unseen.delete(plot); watch.unobserve(plot); Plotly.newPlot(plot, data, layout, options); });
   watch.observe(plot);
   next();
 }
+const watch = new IntersectionObserver(seen => {
+  for (const one of seen) if (one.isIntersecting && unseen.has(one.target)) unseen.get(one.target)();
+});
 draw(0);
 function width(px) {
   for (const plot of document.querySelectorAll(".js-plotly-plot")) {
     Plotly.relayout(plot, {width: px, autosize: px === null});
   }
 }
-addEventListener("beforeprint", () => width(1000));
+addEventListener("beforeprint", () => {
+  for (const part of document.querySelectorAll("details")) part.open = true;
+  for (const show of [...unseen.values()]) show();
+  width(1000);
+});
 addEventListener("afterprint", () => width(null));
 """
 
@@ -120,7 +125,12 @@ def figures(report: Report, pen: dict[str, Pen]) -> list[Figure]:
         paths.states,
         paths.space,
     )
-    return [figure for draw in order if (figure := draw(report, pen)) is not None]
+    drawn = [figure for draw in order if (figure := draw(report, pen)) is not None]
+    for figure in drawn:
+        below = figure.layout.get("xaxis", {})
+        if below.get("title") == {"text": TIME} and "range" not in below:
+            below["range"] = list(report.span_s())
+    return drawn
 
 
 def _facts(report: Report) -> str:
@@ -153,9 +163,15 @@ def _words(report: Report) -> str:
 
 def _figure(number: int, figure: Figure) -> str:
     return (
-        f"<section><h2>{escape(figure.title)}</h2><figure><figcaption>{escape(figure.words())}</figcaption>"
+        f"<section id={_anchor(figure.title)}><h2>{escape(figure.title)}</h2>"
+        f"<figure><figcaption>{escape(figure.words())}</figcaption>"
         f'<div id=figure{number} style="height:{figure.layout["height"]}px"></div></figure></section>\n'
     )
+
+
+def _anchor(title: str) -> str:
+    """A title of ours as the name of its section."""
+    return title.lower().replace(" ", "-")
 
 
 def _json(drawn: list[Figure]) -> str:

@@ -59,7 +59,7 @@ class Figure:
         """The caption, with what was left out to draw it."""
         if self.most <= 1.0:
             return self.caption
-        return f"{self.caption} Drawn with one point in {self.most:.1f}, the lowest and highest of every stretch kept."
+        return f"{self.caption} Drawn with one point in {self.most:.2g}, the lowest and highest of every stretch kept."
 
 
 def pens(labels: Sequence[tuple[str, str, bool]]) -> dict[str, Pen]:
@@ -107,8 +107,18 @@ def stacked(titles: Sequence[str], x_title: str, panel_px: int = PANEL_PX, **y_o
         axes[f"yaxis{k + 1 if k else ''}"] = axis("", domain=[max(1 - (k + 1) / count, 0.0), top], **y_options)
         place = {"x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom"}
         notes.append({"text": f"<b>{title}</b>", "showarrow": False, **place})
-    below = axis(x_title, anchor=axis_name(count - 1))
+    below = axis(x_title, anchor=axis_name(count - 1), zeroline=False)
     return layout(count * panel_px + MARGIN_PX, xaxis=below, hovermode="x", annotations=notes, **axes)
+
+
+def log_ticks(low: float, high: float) -> dict[str, Any]:
+    """A logarithmic axis from ``low`` to ``high``, few ticks on it: 1, 2, 5 over up to two decades, else powers."""
+    first, last = np.floor(np.log10(low)), np.ceil(np.log10(high))
+    steps = (1, 2, 5) if np.log10(high / low) < 2 else (1,)
+    ticks = [step * 10.0**power for power in np.arange(first, last + 1) for step in steps]
+    margin = 0.05 * max(np.log10(high / low), 0.3)
+    limits = [float(np.log10(low) - margin), float(np.log10(high) + margin)]
+    return {"type": "log", "range": limits, "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
 
 
 def axis_name(panel: int) -> str:
@@ -152,8 +162,8 @@ def faint(colour: str, opacity: float = 0.13) -> str:
 
 
 def labelled(names: Sequence[str]) -> list[str]:
-    """Names from logs and rigs as plotly shows them: it reads some HTML in every label."""
-    return [escape(name) for name in names]
+    """Names from logs and rigs as plotly shows them, in words: it reads some HTML in every label."""
+    return [escape(name.replace("_", " ")) for name in names]
 
 
 def point_of_truth(truth: Truth) -> str:

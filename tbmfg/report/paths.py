@@ -82,6 +82,21 @@ def _paths(report: Report, pen: dict[str, Pen], figure: Figure, project: Callabl
                 "x": packed(x), "y": packed(y), "hovertemplate": "%{x:.3f}, %{y:.3f} m", "legendrank": one.rank,
             }
         )  # fmt: skip
+    _ends(report, figure, project)
+
+
+def _ends(report: Report, figure: Figure, project: Callable[[Floats], Floats]) -> None:
+    """Marks where the first trajectory begins and ends."""
+    ends = project(report.tracks[0].path.position_n)[[0, -1]]
+    for name, symbol, at in zip(("start", "end"), ("circle", "square"), ends, strict=True):
+        marker = {"symbol": symbol, "size": 10, "color": "#ffffff", "line": {"color": BLACK, "width": 1.8}}
+        figure.data.append(
+            {
+                "type": "scatter", "mode": "markers", "name": name, "x": packed(at[:1]), "y": packed(at[1:]),
+                "hovertemplate": f"{name}: %{{x:.3f}}, %{{y:.3f}} m", "marker": marker, "cliponaxis": False,
+                "legendrank": 2000,
+            }
+        )  # fmt: skip
 
 
 def space(report: Report, pen: dict[str, Pen]) -> Figure:

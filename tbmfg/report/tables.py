@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from math import floor, log10
 from typing import Any
 
 from tbmfg.comparison import columns, ran, rows
@@ -14,8 +15,8 @@ from tbmfg.report.words import nees_bounds
 PARTS = ("used", "gated", "late", "duplicate", "nonfinite", "outage", "unused")
 
 
-def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML already."""
+def table(header: Sequence[str], body: Sequence[Sequence[str]], kind: str = "") -> str:
+    """A table of cells that are HTML already; ``kind`` is a class of its style."""
     if not body:
         return ""
     head = "".join(f"<th scope=col>{cell}</th>" for cell in header)
@@ -23,7 +24,8 @@ def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
         f"<tr><th scope=row>{first}</th>{''.join(f'<td>{cell}</td>' for cell in others)}</tr>"
         for first, *others in body
     )
-    return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{lines}</tbody></table></div>"
+    rows_html = f"<thead><tr>{head}</tr></thead><tbody>{lines}</tbody>"
+    return f"<div class=wide><table class='{kind}'>{rows_html}</table></div>"
 
 
 def comparison(report: Report, pen: dict[str, Pen]) -> str:
@@ -57,7 +59,7 @@ def comparison(report: Report, pen: dict[str, Pen]) -> str:
             "it where it lies by chance in 99 % of runs as correlated as this one. Over its Cramer-Rao bound, from the "
             "whole log or for a causal trajectory from the past alone, an error is about 1 where nothing is lost."
         )
-    return table(header, body) + f"<p class=note>{escape(' '.join(notes))}</p>"
+    return table(header, body, "stacked") + f"<p class=note>{escape(' '.join(notes))}</p>"
 
 
 def calibrations(report: Report, pen: dict[str, Pen]) -> str:
@@ -65,7 +67,7 @@ def calibrations(report: Report, pen: dict[str, Pen]) -> str:
     summaries = ran(report.summaries)
     names = list(dict.fromkeys(name for summary in summaries.values() for name in summary["calibration"]))
     body = [
-        [escape(name), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
+        [escape(_titled(name)), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
         for name in names
     ]
     header = ["calibration", *(swatch(_first_pen(pen, name), name) for name in summaries)]
@@ -78,7 +80,26 @@ def _calibrated(entry: dict[str, Any] | None) -> str:
     values, sds = (x if isinstance(x, list | tuple) else [x] for x in (entry["value"], entry["sd"]))
     if not entry["estimated"]:
         return f"{', '.join(number(x) for x in values)} <small>given, not estimated</small>"
-    return "<br>".join(f"{number(value)} <small>± {number(sd)}</small>" for value, sd in zip(values, sds, strict=True))
+    return "<br>".join(known(value, sd) for value, sd in zip(values, sds, strict=True))
+
+
+UNITS = {"m": "m", "s": "s", "deg": "deg", "ut": "µT", "mm": "mm"}  # what a calibration's name ends with
+
+
+def _titled(name: str) -> str:
+    """``prism_lever_arm_m`` as prism lever arm, m."""
+    words, _, unit = name.rpartition("_")
+    return f"{words.replace('_', ' ')}, {UNITS[unit]}" if unit in UNITS else name.replace("_", " ")
+
+
+def known(value: float, sd: float) -> str:
+    """A value and its standard deviation, to the second digit of the latter."""
+    if not 0 < sd < float("inf"):
+        return f"{number(value)} <small>± {number(sd)}</small>"
+    digits = 1 - floor(log10(sd))
+    if not 0 <= digits <= 9:
+        return f"{value:.4g} <small>± {sd:.2g}</small>"
+    return f"{value:.{digits}f} <small>± {sd:.{digits}f}</small>"
 
 
 def counts(report: Report) -> str:

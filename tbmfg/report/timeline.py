@@ -45,7 +45,8 @@ def availability(report: Report, pen: dict[str, Pen]) -> Figure:
             own = [i for _, i in intervals if i["sensor"] == sensor and i["kind"] == kind]
             bars += [(row, *span) for span in merged(((i["start_s"], i["end_s"]) for i in own), finest)]
         figure.data.append(_bars(escape(kind), KINDS.get(kind, OTHER_KIND), 7, bars, True))
-    figure.layout = _rows([row.replace("_", " ") for row in rows])
+    figure.layout = _rows(rows)
+    figure.layout["xaxis"]["range"] = [begin, max(end, begin + 1.0)]  # of all stamps: a clock may be far off
     return figure
 
 
