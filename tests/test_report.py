@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from tbmfg.report import Report
 from tbmfg.report.content import rotation_sd_n
 from tbmfg.report.page import figures
-from tbmfg.report.panels import COLOURS, pens
+from tbmfg.report.panels import COLOURS, log_ticks, pens
 from tbmfg.report.paths import angle_rates
+from tbmfg.report.tables import known
 from tbmfg.report.thin import band, broken, extremes, packed, segments
 from tbmfg.report.timeline import merged, present
 from tbmfg.report.words import findings
@@ -196,6 +197,27 @@ def test_estimators_keep_their_colour_and_causal_ones_are_dotted():
     assert len({(p.colour, p.dash) for p in many.values()}) == 15
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.05, 1.2), (1.2, 1.5), (1.0, 1.001), (1e-6, 1e3), (7.0, 35.0)])
+def test_a_logarithmic_axis_has_ticks_that_fit_beside_each_other(low, high):
+    made = log_ticks(low, high)
+    first, last = made["range"]
+    assert first < np.log10(low) < np.log10(high) < last
+    ticks = np.log10(made["tickvals"])
+    assert 2 <= len(ticks) <= 11
+    assert first < ticks.min() < ticks.max() < last
+    assert np.diff(ticks).min() > (last - first) / 15 or high / low < 1.1  # of 130 pixels
+    assert len(set(made["ticktext"])) == len(ticks)
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "shown"),
+    [(0.092941, 0.003548, "0.0929 ± 0.0035"), (1.0, 0.0999, "1.000 ± 0.100"), (1234.5, 56.0, "1234 ± 56"),
+     (0.5, 0.0, "0.5 ± 0"), (2e-12, 3e-11, "2e-12 ± 3e-11")],
+)  # fmt: skip
+def test_calibrations_have_the_digits_that_are_known(value, sd, shown):
+    assert re.sub("<.*?>", "", known(value, sd)) == shown
+
+
 # ---- words ----
 
 
@@ -217,6 +239,12 @@ def test_words_come_in_order_of_importance_and_once():
         "estimator-0: its errors are 2.3 times wh",
         "estimator-1 (causal): its errors are 2.3",
     ]
+
+
+def test_an_estimator_without_covariance_claims_nothing():
+    made, path = Report("toy", "", EPOCH_NS), trajectory()
+    made.add(Result("sbm-cf", replace(path, cov=0 * path.cov)), SUMMARY | {"estimator": "sbm-cf"}, None)
+    assert findings(made)[0].lines[0].startswith("sbm-cf: does not say how sure it is; against the truth")
 
 
 def test_without_truth_the_report_says_so():
@@ -254,10 +282,15 @@ def test_far_coordinates_are_drawn_to_the_millimetre():
 def test_the_states_of_a_shaft_machine_are_shown_where_there_are_any():
     made = report()
     state = {"start_s": 0.0, "end_s": 9.0, "level": "stop", "case": 3, "direction": "up <left>", "spot_mm": [1.0, -2.5]}
-    made.summaries["estimator-0"] = made.summaries["estimator-0"] | {"deviation": {"timeline": [state]}}
+    normal = state | {"start_s": 9.0, "end_s": 10.0, "level": "normal", "case": None}
+    told = {"timeline": [state, normal], "level_s": {"normal": 1.0, "troubleshoot": 0.0, "stop": 9.0}}
+    made.summaries["estimator-0"] = made.summaries["estimator-0"] | {"deviation": told}
     figure = next(figure for figure in drawn(made) if figure.title.startswith("Deviation"))
     assert [trace["name"] for trace in figure.data] == ["normal", "troubleshoot", "stop"]
-    assert "direction: up &lt;left&gt;<br>spot mm: 1, -2.5" in figure.data[2]["text"][0]
+    assert "direction: up &lt;left&gt;<br>spot, mm: 1, -2.5" in figure.data[2]["text"][0]
+    page = parsed(made.html()).text
+    assert "estimator-0 outside of normal" in page
+    assert "0.0 – 9.0stop3up <left>1, -2.5" in page
 
 
 def test_an_hour_at_ten_hertz_stays_small():

@@ -39,7 +39,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .8rem; backgrou
 .grave { border-left: 5px solid #D55E00; padding-left: .8rem; }
 .stacked td small { display: block; }
 .swatch { display: inline-block; width: 1.6rem; margin-right: .4rem; vertical-align: middle; }
-figure { margin: 0; }
+figure { margin: 0; } figure + .wide { margin-top: .8rem; }
 @page { size: A4; margin: 12mm; }
 @media print {
   body { padding: 0; width: 1000px; max-width: none; font-size: 15px; }
@@ -165,7 +165,7 @@ def _figure(number: int, figure: Figure) -> str:
     return (
         f"<section id={_anchor(figure.title)}><h2>{escape(figure.title)}</h2>"
         f"<figure><figcaption>{escape(figure.words())}</figcaption>"
-        f'<div id=figure{number} style="height:{figure.layout["height"]}px"></div></figure></section>\n'
+        f'<div id=figure{number} style="height:{figure.layout["height"]}px"></div></figure>{figure.table}</section>\n'
     )
 
 

@@ -42,7 +42,7 @@ class Pen:
 class Figure:
     """A figure: plotly's data and layout, the heading above it and the words below.
 
-    ``most`` is the largest number of samples that one point drawn stands for.
+    ``most`` is the largest number of samples that one point drawn stands for; ``table``: HTML that follows.
     """
 
     title: str
@@ -50,6 +50,7 @@ class Figure:
     data: list[dict[str, Any]] = field(default_factory=list)
     layout: dict[str, Any] = field(default_factory=dict)
     most: float = 1.0
+    table: str = ""
 
     def thinned(self, before: int, after: int) -> None:
         """Note that ``after`` points stand for ``before``."""
@@ -112,13 +113,23 @@ def stacked(titles: Sequence[str], x_title: str, panel_px: int = PANEL_PX, **y_o
 
 
 def log_ticks(low: float, high: float) -> dict[str, Any]:
-    """A logarithmic axis from ``low`` to ``high``, few ticks on it: 1, 2, 5 over up to two decades, else powers."""
-    first, last = np.floor(np.log10(low)), np.ceil(np.log10(high))
-    steps = (1, 2, 5) if np.log10(high / low) < 2 else (1,)
-    ticks = [step * 10.0**power for power in np.arange(first, last + 1) for step in steps]
+    """A logarithmic axis from ``low`` to ``high`` with a few ticks on it: powers of ten, 1-2-5, or finer ones."""
     margin = 0.05 * max(np.log10(high / low), 0.3)
-    limits = [float(np.log10(low) - margin), float(np.log10(high) + margin)]
-    return {"type": "log", "range": limits, "tickvals": ticks, "ticktext": [f"{tick:g}" for tick in ticks]}
+    first, last = np.log10(low) - margin, np.log10(high) + margin
+    powers = 10.0 ** np.arange(np.floor(first), np.ceil(last) + 1)
+    finer = (([1.0], 3), ([1.0, 2.0, 5.0], 2), (np.arange(1.0, 10.0), 2), (np.arange(10.0, 100.0) / 10, 2))
+    for steps, enough in finer:
+        ticks = np.outer(powers, steps).ravel()
+        ticks = ticks[(ticks > 10**first) & (ticks < 10**last)]
+        if len(ticks) >= enough:
+            break
+    shown = ticks if len(ticks) > 1 else np.array([low, high])
+    return {
+        "type": "log",
+        "range": [float(first), float(last)],
+        "tickvals": shown.tolist(),
+        "ticktext": [f"{tick:.4g}" for tick in shown],
+    }
 
 
 def axis_name(panel: int) -> str:

@@ -12,6 +12,7 @@ from tbmfg.report.content import Report
 from tbmfg.report.panels import Pen
 from tbmfg.report.words import nees_bounds
 
+NORMAL, STATES = "normal", 20  # the level that needs no words, and how many of the others are listed
 PARTS = ("used", "gated", "late", "duplicate", "nonfinite", "outage", "unused")
 
 
@@ -67,7 +68,7 @@ def calibrations(report: Report, pen: dict[str, Pen]) -> str:
     summaries = ran(report.summaries)
     names = list(dict.fromkeys(name for summary in summaries.values() for name in summary["calibration"]))
     body = [
-        [escape(_titled(name)), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
+        [escape(titled(name)), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
         for name in names
     ]
     header = ["calibration", *(swatch(_first_pen(pen, name), name) for name in summaries)]
@@ -83,10 +84,17 @@ def _calibrated(entry: dict[str, Any] | None) -> str:
     return "<br>".join(known(value, sd) for value, sd in zip(values, sds, strict=True))
 
 
-UNITS = {"m": "m", "s": "s", "deg": "deg", "ut": "µT", "mm": "mm"}  # what a calibration's name ends with
+UNITS = {
+    "m": "m",
+    "s": "s",
+    "deg": "deg",
+    "ut": "µT",
+    "mm": "mm",
+    "kpkm": "K/km",
+}  # what a calibration's name ends with
 
 
-def _titled(name: str) -> str:
+def titled(name: str) -> str:
     """``prism_lever_arm_m`` as prism lever arm, m."""
     words, _, unit = name.rpartition("_")
     return f"{words.replace('_', ' ')}, {UNITS[unit]}" if unit in UNITS else name.replace("_", " ")
@@ -116,6 +124,43 @@ def counts(report: Report) -> str:
         for cells, names in by_counts.items():
             body.append([escape(sensor), escape("all" if len(by_counts) == 1 else ", ".join(names)), *cells])
     return table(["sensor", "estimator", "received", *shown], body)
+
+
+def deviations(report: Report, pen: dict[str, Pen]) -> str:
+    """What the figure of a shaft machine's deviation shows when it is pointed at: how long each estimator was at which
+    level, and what the first says while it is not normal."""
+    told = {name: s["deviation"] for name, s in report.summaries.items() if s.get("deviation")}
+    if not told:
+        return ""
+    levels = list(dict.fromkeys(level for one in told.values() for level in one["level_s"]))
+    spent = table(
+        ["seconds", *levels],
+        [
+            [swatch(_first_pen(pen, name), name), *(f"{one['level_s'].get(level, 0.0):.1f}" for level in levels)]
+            for name, one in told.items()
+        ],
+    )
+    name, first = next(iter(told.items()))
+    states = [state for state in first["timeline"] if state["level"] != NORMAL]
+    longest = sorted(sorted(states, key=lambda s: s["start_s"] - s["end_s"])[:STATES], key=lambda s: s["start_s"])
+    keys = [key for key in (longest[0] if longest else ()) if key not in ("start_s", "end_s")]
+    listed = table(
+        ["from – to, s", *(escape(titled(key)) for key in keys)],
+        [[f"{s['start_s']:.1f} – {s['end_s']:.1f}", *(escape(worded(s[key])) for key in keys)] for s in longest],
+    )
+    if not listed:
+        return spent
+    some = f", the longest {STATES} of {len(states)} stretches" if len(states) > STATES else ""
+    return f"{spent}<h3>{escape(name)} outside of normal{some}</h3>{listed}"
+
+
+def worded(value: Any) -> str:
+    """What a state holds, as a reader takes it in."""
+    if isinstance(value, list | tuple):
+        return ", ".join(map(worded, value))
+    if value is None:
+        return "–"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def swatch(pen: Pen | None, label: str) -> str:

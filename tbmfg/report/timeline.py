@@ -10,6 +10,7 @@ import numpy as np
 
 from tbmfg.report.content import Report
 from tbmfg.report.panels import GRID, TIME, Figure, Pen, axis, labelled, layout
+from tbmfg.report.tables import deviations, titled, worded
 from tbmfg.report.thin import packed, segments
 from tbmfg.timeseries import Floats
 
@@ -57,8 +58,8 @@ def deviation(report: Report, pen: dict[str, Pen]) -> Figure | None:
         return None
     figure = Figure(
         "Deviation of the shaft machine",
-        "Level by the dual-coordinate method; point at a bar for the case, the direction of the deviation, the spot on "
-        "the detector and the angles.",
+        "Level by the dual-coordinate method. Point at a bar, or look below, for the case, the direction of the "
+        "deviation, the spot on the detector and the angles.",
     )
     for level, colour in LEVELS.items():
         bars, texts = [], []
@@ -68,6 +69,7 @@ def deviation(report: Report, pen: dict[str, Pen]) -> Figure | None:
             texts += [_state_in_words(state) for state in own]
         figure.data.append(_bars(escape(level), colour, 14, bars, True, texts))
     figure.layout = _rows(list(told))
+    figure.table = deviations(report, pen)
     return figure
 
 
@@ -97,8 +99,7 @@ def _state_in_words(state: dict[str, Any]) -> str:
     for key, value in state.items():
         if key in ("start_s", "end_s", "level"):
             continue
-        text = ", ".join(f"{x:.3g}" for x in value) if isinstance(value, list | tuple) else str(value)
-        parts.append(f"{key.replace('_', ' ')}: {text}")
+        parts.append(f"{titled(key)}: {worded(value)}")
     return escape(f"{state['start_s']:.1f}–{state['end_s']:.1f} s") + "<br>" + "<br>".join(escape(p) for p in parts)
 
 

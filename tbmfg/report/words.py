@@ -51,6 +51,8 @@ def _results(report: Report) -> Iterable[str]:
 def _claim(track: Track) -> str:
     position = np.linalg.norm(track.position_sd(), axis=1)
     heading = np.rad2deg(track.rotation_sd()[:, 2])
+    if not position.any():
+        return "does not say how sure it is"
     worst = int(position.argmax())
     at_s = (track.path.t_ns[worst] - track.path.t_ns[0]) * 1e-9
     return (
