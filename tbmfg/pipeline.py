@@ -179,7 +179,6 @@ def open_session(
     from tbmfg.prepare import prepare
 
     started = time.perf_counter()
-    assumed: list[str] = []
     log = log_path
     if isinstance(log, Log):
         if (start_s, end_s) != (None, None):
@@ -193,7 +192,9 @@ def open_session(
         log = read_log(log_path, progress=partial(progress, "reading") if progress else None, **part)
         if rig is None:  # a log that was cut lists no attachments and may have some
             rig = given_rig(None, log.attachments, log.path, overrides)
-    if rig is None:
+    if rig is not None:
+        assumed = rig.assumptions()
+    else:
         rig, assumed = inferred_rig(log, overrides)
     check_switches(rig)
     dropped = dropped_sensors(rig, without, only)

@@ -26,7 +26,10 @@ from tbmfg.state import Calibrated, Counts, Result, Trajectory
 from tbmfg.timeseries import Log, Series
 
 EPOCH_NS = 1_700_000_000_000_000_000
-RIG = "name: toy\nsensors: {imu: {topic: /imu}, prism: {topic: /prism}, odometer: {topic: /odometry}}\n"
+RIG = """name: toy
+origin: {latitude_deg: 47}
+sensors: {imu: {topic: /imu}, prism: {topic: /prism}, odometer: {topic: /odometry}}
+"""
 ROOT = Path(__file__).parent.parent
 
 
@@ -197,6 +200,17 @@ def test_options_reach_the_stages(toy, tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["options"]["set"] == ["sensors.prism.sigma_mm=7", "lag_s=3"]
     assert summary["metrics"] is None
+
+
+def test_what_the_rig_leaves_open_is_said_apart_from_warnings(toy, tmp_path):
+    open_ended = ("--set", "origin.latitude_deg=null", "--set", "initial.yaw_deg=30")
+    for number, command in enumerate(("run", "compare")):
+        estimators = ("--estimators", "batch,fixed-lag") if command == "compare" else ()
+        ran = tbmfg(command, "toy.mcap", "-o", str(tmp_path / str(number)), *open_ended, *estimators)
+        lines = ran.stdout.splitlines()
+        assert lines.count("assumed origin.latitude_deg: not given: no Earth rate, gravity 9.80665 m/s^2") == 1
+        assert lines.count("assumed initial.yaw_deg: 30 counts for nothing, as yaw_sd_deg is 180") == 1
+        assert lines.count("warning: imu: 3 samples lost") == 1
 
 
 def test_only_keeps_the_imu(toy, tmp_path):

@@ -282,13 +282,13 @@ def test_without_latitude_there_is_no_earth_rate_and_it_is_said():
     rig = parse_rig(MINIMAL, "rig.yaml")
     assert_allclose(rig.origin.rate_n, 0)
     assert rig.origin.gravity == 9.80665
-    assert rig.assumptions() == ["origin.latitude_deg is not given: no Earth rate, standard gravity 9.80665 m/s^2"]
+    assert rig.assumptions() == ["assumed origin.latitude_deg: not given: no Earth rate, gravity 9.80665 m/s^2"]
     assert load_rig("tbm").assumptions() == []
 
 
 def test_yaw_without_its_sd_has_no_weight_and_it_is_said():
     rig = override(load_rig("tbm"), ["initial.yaw_deg=12"])
-    assert rig.assumptions() == ["initial.yaw_deg 12 has no weight: yaw_sd_deg is 180"]
+    assert rig.assumptions() == ["assumed initial.yaw_deg: 12 counts for nothing, as yaw_sd_deg is 180"]
 
 
 def test_every_field_is_described():

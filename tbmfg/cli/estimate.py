@@ -103,8 +103,7 @@ def _print_summary(out: Terminal, summary: dict[str, Any], output: str) -> None:
         metrics = summary.get(key) or {}
         known = [(name, number(value)) for name, value in metrics.items() if value is not None]
         out.table([f"{key} against {summary['truth']}", ""], known)
-    for warning in summary["warnings"]:
-        out.warn(warning)
+    _print_warnings(out, summary["log"], summary["warnings"])
     out.say(f"results: {output}")
 
 
@@ -129,6 +128,18 @@ def _print_comparison(out: Terminal, summaries: dict[str, dict[str, Any]], outpu
     out.say(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
     for name, why in comparison.not_run(summaries).items():
         out.say(f"{name} not run: {why}")
-    for warning in dict.fromkeys(warning for summary in ran.values() for warning in summary["warnings"]):
-        out.warn(warning)
+    _print_warnings(out, first["log"], [warning for summary in ran.values() for warning in summary["warnings"]])
     out.say(f"results: {output}, to read: {output}/{REPORT}")
+
+
+def _print_warnings(out: Terminal, log: str, lines: list[str]) -> None:
+    """What was assumed where nobody said, then what is wrong; each once."""
+    lines = list(dict.fromkeys(lines))
+    assumed = [line for line in lines if line.startswith(("assumed ", "not used: "))]
+    for line in assumed:
+        out.say(line)
+    if any(line.startswith("assumed sensors.") for line in assumed):
+        out.say(f"to have this in a file and correct it: tbmfg init {log} -o rig.yaml")
+    for line in lines:
+        if line not in assumed:
+            out.warn(line)

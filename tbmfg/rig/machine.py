@@ -209,9 +209,9 @@ class Rig(Node):
         """What the rig leaves open and how it is filled: lines to show the user."""
         said = []
         if self.origin.latitude_deg is None and not self.of_kind("gnss"):
-            said.append(f"origin.latitude_deg is not given: no Earth rate, standard gravity {STANDARD_GRAVITY} m/s^2")
+            said.append(f"assumed origin.latitude_deg: not given: no Earth rate, gravity {STANDARD_GRAVITY} m/s^2")
         if self.initial.yaw_deg is not None and self.initial.yaw_sd_deg >= 180:
-            said.append(f"initial.yaw_deg {self.initial.yaw_deg:g} has no weight: yaw_sd_deg is 180")
+            said.append(f"assumed initial.yaw_deg: {self.initial.yaw_deg:g} counts for nothing, as yaw_sd_deg is 180")
         return said
 
     @field_validator("sensors", mode="before")
