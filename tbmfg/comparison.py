@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,3 +72,11 @@ def rows(summaries: Summaries) -> list[Row]:
 def columns(found: list[Row]) -> list[Column]:
     """The columns that any of the rows fills."""
     return [column for column in COLUMNS if any(column.of(row.metrics) is not None for row in found)]
+
+
+def together(lines: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Lines, each once, and the names of those that say it, from (name, line)."""
+    by_line: dict[str, list[str]] = {}
+    for name, line in lines:
+        by_line.setdefault(line, []).append(name)
+    return by_line

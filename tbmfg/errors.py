@@ -23,6 +23,9 @@ class EstimationError(TbmfgError):
 def reason(error: BaseException) -> str:
     """What went wrong, in one line; of what nobody foresaw also its kind."""
     text = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.filename is not None:
+        named = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError | NotADirectoryError)
+        return f"{error.filename}: {(error.strerror or 'cannot be used').lower()}" + "; check the name" * named
     if isinstance(error, TbmfgError | OSError):
         return text
     return f"internal error: {type(error).__name__}: {text}"

@@ -45,7 +45,7 @@ def ins(problem: Problem, progress: Progress) -> Result:
     f = filter_.run(problem, fixed=("clock_offset",), progress=progress)
     out = result(problem, "ins", f.x, f.cov, f.c, f.c_cov, f.nis, f.gated)
     out.warnings += [
-        f"{sensor}: the gate was opened {times} times after {filter_.REOPEN} rejections in a row"
+        f"{sensor}: after {filter_.REOPEN} rejections in a row the gate was opened, {times} in all"
         for sensor, times in f.reopened.items()
         if times
     ]

@@ -56,6 +56,8 @@ def make(
         raise TbmfgError(f"{output}: a map ends in {' or '.join(FORMATS)}")
     for file in (output, output.with_suffix(".png")):
         refuse_existing_file(file, force)
+    if not (folder / "result.npz").is_file():
+        raise TbmfgError(f"{folder}: holds no result; make one: tbmfg run {log_path} -o {folder}")
     log = read_log(log_path)
     rig = load_rig(folder / "rig.yaml")
     path = read_result_npz(folder / "result.npz")

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from tbmfg import cli, doctor, pipeline
 from tbmfg.cli import options, terminal
 from tbmfg.cli.terminal import Terminal
-from tbmfg.errors import EstimationError, LogError, TbmfgError
+from tbmfg.errors import EstimationError, LogError, TbmfgError, reason
 from tbmfg.rig import parse_rig
 from tbmfg.state import Calibrated, Counts, Result, Trajectory
 from tbmfg.timeseries import Log, Series
@@ -401,6 +401,34 @@ def test_the_unexpected_takes_one_line_and_debug_shows_it(toy, tmp_path):
     ran = tbmfg("run", "toy.mcap", "-o", str(tmp_path), "--debug")
     assert ran.exit_code == 1
     assert "Traceback" in ran.stderr
+
+
+def test_a_file_that_is_not_there_is_named(toy, tmp_path):
+    ran = tbmfg("batch", str(tmp_path / "absent.mcap"), "-o", str(tmp_path / "out"), "--jobs", "1")
+    assert ran.exit_code == 1
+    assert (
+        f"failed: {tmp_path}/absent.mcap: {tmp_path}/absent.mcap: no such file or directory; check the name"
+        in ran.stdout
+    )
+    assert "holds no result; make one: tbmfg run toy.mcap" in fault(
+        "map", "toy.mcap", "--trajectory", "x", "-o", "m.ply"
+    )
+    assert reason(OSError(28, "No space left on device", "out/x")) == "out/x: no space left on device"
+
+
+def test_warnings_name_the_estimators_that_give_them(toy, tmp_path):
+    plain = toy_estimate
+
+    def estimate(name, prepared, *, progress=None):
+        result = plain(name, prepared)
+        result.warnings.append(f"of {name}")
+        return result
+
+    toy.estimate = estimate
+    said = tbmfg("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch,fixed-lag").stdout.splitlines()
+    assert "warning: odometer: not estimated" in said
+    assert "warning: batch: of batch" in said
+    assert "warning: fixed-lag: of fixed-lag" in said
 
 
 def test_an_unknown_estimator_is_an_error_in_python_too(toy):

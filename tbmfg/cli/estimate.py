@@ -128,13 +128,14 @@ def _print_comparison(out: Terminal, summaries: dict[str, dict[str, Any]], outpu
     out.say(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
     for name, why in comparison.not_run(summaries).items():
         out.say(f"{name} not run: {why}")
-    _print_warnings(out, first["log"], [warning for summary in ran.values() for warning in summary["warnings"]])
+    told = comparison.together((name, line) for name, summary in ran.items() for line in summary["warnings"])
+    lines = [line if len(names) == len(ran) else f"{', '.join(names)}: {line}" for line, names in told.items()]
+    _print_warnings(out, first["log"], lines)
     out.say(f"results: {output}, to read: {output}/{REPORT}")
 
 
 def _print_warnings(out: Terminal, log: str, lines: list[str]) -> None:
-    """What was assumed where nobody said, then what is wrong; each once."""
-    lines = list(dict.fromkeys(lines))
+    """What was assumed where nobody said, then what is wrong."""
     assumed = [line for line in lines if line.startswith(("assumed ", "not used: "))]
     for line in assumed:
         out.say(line)

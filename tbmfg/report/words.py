@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tbmfg.comparison import not_run, ran, rows
+from tbmfg.comparison import not_run, ran, rows, together
 from tbmfg.evaluation.metrics import chi_square_bounds
 from tbmfg.report.content import Report, Track
 
@@ -29,11 +29,12 @@ def findings(report: Report) -> list[Finding]:
     own = [
         (name, line) for name, summary in ran(summaries).items() for line in summary["warnings"] if line not in shared
     ]
+    told = [f"{', '.join(names)}: {line}" for line, names in together(own).items()]
     groups = [
         Finding("Result", [*_results(report)]),
         Finding("Not run", [f"{name}: {why}" for name, why in not_run(summaries).items()]),
         Finding("Surer than it should be", list(_overconfident(report)), grave=True),
-        Finding("What the estimators warn of", _together(own), grave=True),
+        Finding("What the estimators warn of", told, grave=True),
         Finding("What the log and the rig gave rise to", list(report.found)),
         Finding("Assumed, because nobody said", list(report.assumed)),
     ]
@@ -88,14 +89,6 @@ def nees_bounds(metrics: dict[str, Any]) -> tuple[float, float] | None:
     if metrics.get("nees_mean") is None or not metrics.get("nees_n_eff"):
         return None
     return chi_square_bounds(metrics["nees_n_eff"], metrics["nees_dof"])
-
-
-def _together(lines: Iterable[tuple[str, str]]) -> list[str]:
-    """A line that several estimators say is said once, with their names."""
-    by_line: dict[str, list[str]] = {}
-    for name, line in lines:
-        by_line.setdefault(line, []).append(name)
-    return [f"{', '.join(names)}: {line}" for line, names in by_line.items()]
 
 
 def length(metres: float) -> str:
