@@ -416,6 +416,11 @@ def test_a_file_that_is_not_there_is_named(toy, tmp_path):
     assert reason(OSError(28, "No space left on device", "out/x")) == "out/x: no space left on device"
 
 
+def test_a_map_without_a_result_says_what_makes_one():
+    said = fault("map", "toy.mcap", "--trajectory", "x", "-o", "m.ply")
+    assert "x: holds no result; make one: tbmfg run toy.mcap -o x" in said
+
+
 def test_warnings_name_the_estimators_that_give_them(toy, tmp_path):
     plain = toy_estimate
 
