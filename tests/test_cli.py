@@ -410,9 +410,6 @@ def test_a_file_that_is_not_there_is_named(toy, tmp_path):
         f"failed: {tmp_path}/absent.mcap: {tmp_path}/absent.mcap: no such file or directory; check the name"
         in ran.stdout
     )
-    assert "holds no result; make one: tbmfg run toy.mcap" in fault(
-        "map", "toy.mcap", "--trajectory", "x", "-o", "m.ply"
-    )
     assert reason(OSError(28, "No space left on device", "out/x")) == "out/x: no space left on device"
 
 
