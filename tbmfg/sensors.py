@@ -383,6 +383,9 @@ class Rows:
         self, xi: Floats, xj: Floats, c: Floats, rows: slice = slice(None)
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """The same for the given rows, whose states are given one by one."""
-        weight = 1.0 / self.sigma[rows]
-        r, *jacobians = MODELS[self.model](self.z[rows], self.data[rows], xi, xj, c[self.calib])
-        return (r * weight, *(J * weight[:, :, None] for J in jacobians))
+        sigma = self.sigma[rows]
+        r, Ji, Jj, Jc = MODELS[self.model](self.z[rows], self.data[rows], xi, xj, c[self.calib])
+        r /= sigma
+        for J in (Ji, Jj, Jc):
+            J /= sigma[:, :, None]
+        return r, Ji, Jj, Jc

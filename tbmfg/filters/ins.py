@@ -17,7 +17,6 @@ from scipy.stats import chi2
 from tbmfg.filters.kalman import correct, innovation, predict
 from tbmfg.inertial.strapdown import correct_state, propagate
 from tbmfg.problem import GATE, Problem
-from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
@@ -67,10 +66,12 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
     in_a_row, reopened = dict.fromkeys(nis, 0), dict.fromkeys(nis, 0)
+    places = np.full(len(c), -1)
+    places[free] = np.arange(m)
     starts = {rows.sensor: np.searchsorted(rows.j, np.arange(n + 1)) for rows in problem.rows}
     gates = {rows.sensor: chi2.ppf(GATE, rows.dof) for rows in problem.rows}
-    columns = {rows.sensor: np.flatnonzero(np.isin(np.arange(len(c))[rows.calib], free)) for rows in problem.rows}
-    offsets = {rows.sensor: np.searchsorted(free, rows.calib.start) for rows in problem.rows}
+    # where among the free calibrations, or nowhere, those of a sensor are
+    inputs = {rows.sensor: places[rows.calib] for rows in problem.rows}
     cost = 0.0
 
     for k in range(n):
@@ -83,21 +84,19 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
         for rows in problem.rows:
             sensor = rows.sensor
             for r in range(starts[sensor][k], starts[sensor][k + 1]):
-                residual, H = _linearise(rows, r, x, previous, c, P.shape[0], d, m, columns[sensor], offsets[sensor])
-                value, logdet = innovation(P, H, residual)
+                before = previous if rows.i[r] < k else x
+                parts = rows.evaluate_at(before[None], x[None], c, slice(r, r + 1))
+                shut = gates[sensor] if in_a_row[sensor] < REOPEN or rows.loss == "gnc" else np.inf
+                P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut)
                 nis[sensor][r] = value
                 cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
-                if value > gates[sensor] and (in_a_row[sensor] < REOPEN or rows.loss == "gnc"):
+                if value > shut:
                     gated[sensor][r] = True
                     in_a_row[sensor] += 1
                     continue
                 if in_a_row[sensor] >= REOPEN:
                     reopened[sensor] += 1
                 in_a_row[sensor] = 0
-                dx, P = correct(P, H, residual)
-                x = correct_state(x, dx[:d])
-                c[free] += dx[calib]
-                previous[:12] = correct_state(previous, np.concatenate([dx[clone], np.zeros(d - 6)]))[:12]
         xs[k], covs[k] = x, P[:d, :d]
         if progress is not None and k % 500 == 0:
             progress(k / n)
@@ -123,19 +122,30 @@ def _advance(x, P, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd
     return x, P
 
 
-def _linearise(rows: Rows, r: int, x, previous, c, size, d, m, columns, offset) -> tuple[Floats, Floats]:
-    """Whitened residual and Jacobian to [state, free calibrations, clone] of one row."""
-    pair = np.stack([previous, x])
-    one = slice(r, r + 1)
-    binary = rows.i[r] != rows.j[r]
-    parts = rows.evaluate_at(pair[:1] if binary else pair[1:], pair[1:], c, one)
-    residual, Ji, Jj, Jc = (part[0] for part in parts)
-    H = np.zeros((len(residual), size))
-    if binary:
-        H[:, d + m :] = Ji[:, :6]
-        H[:, :d] = Jj
-        H[:, 6:d] += Ji[:, 6:]  # velocity and biases of the previous keyframe are taken as the present ones
+@njit(cache=True)
+def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate):
+    """Correct the state ``x``, the ``previous`` keyframe's pose and the constants ``c``, in place, by one row linearised
+    there, unless its squared normalised innovation is beyond ``gate``: covariance, that innovation, and log det S.
+
+    Errors of ``P`` are [state, free constants, clone]; ``places`` says which of the free ones the columns of Jc are,
+    -1 for known ones.
+    """
+    r, d, clone = residual[0], Ji.shape[2], len(P) - 6
+    H = np.zeros((len(r), len(P)))
+    if Jj.shape[2] > 0:
+        H[:, clone:], H[:, :d] = Ji[0, :, :6], Jj[0]
+        H[:, 6:d] += Ji[0, :, 6:]  # velocity and biases of the previous keyframe are taken as the present ones
     else:
-        H[:, :d] = Ji
-    H[:, d + offset : d + offset + len(columns)] = Jc[:, columns]
-    return residual, H
+        H[:, :d] = Ji[0]
+    for column, place in enumerate(places):
+        if place >= 0:
+            H[:, d + place] = Jc[0, :, column]
+    nis, logdet = innovation(P, H, r)
+    if not nis > gate:
+        dx, P = correct(P, H, r)
+        x[:] = correct_state(x, dx[:d])
+        c[free] += dx[d:clone]
+        pose = np.zeros(d)
+        pose[:6] = dx[clone:]
+        previous[:] = correct_state(previous, pose)
+    return P, nis, logdet

@@ -38,8 +38,8 @@ def correct(P, H, r, R=None):
     PHt = P @ H.T
     S = H @ PHt + (np.eye(len(r)) if R is None else R)
     K = np.linalg.solve(S, PHt.T).T
-    KPHt = K @ PHt.T
-    P1 = P - KPHt - KPHt.T + K @ S @ K.T
+    A = K @ (PHt - 0.5 * K @ S).T
+    P1 = P - A - A.T
     return -(K @ r), 0.5 * (P1 + P1.T)
 
 
