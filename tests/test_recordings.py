@@ -66,13 +66,11 @@ def test_hand_held_unit_in_a_disturbed_field():
     assert error["ins", "total"] <= 2.2
 
 
-@pytest.mark.parametrize("name", ["comma_ex1", "husky"])
-def test_without_positions_smoothing_is_not_worse_than_dead_reckoning(name):
-    """Wheels and gyro, no heading and no rest at the start: a gyro bias of a degree per second bends the whole path."""
-    folders = {"comma_ex1": "comma2k19_wheel_imu", "husky": "husky_odom_imu_gps"}
-    source = data("").parent / folders[name] / f"{name}.npz"
-    rows = reckoning.one_drive(name.partition("_")[0], source, ["batch"], [])
-    share = {(row.estimator, row.metric): row.mean for row in rows}
+def test_without_positions_smoothing_is_not_worse_than_dead_reckoning():
+    """Wheels and gyro, no heading and no rest at the start: a gyro bias of a degree per second bends the whole path,
+    and a solver that stops before it is straight again is off by ten times as much."""
+    source = data("").parent / "husky_odom_imu_gps" / "husky.npz"
+    share = {(row.estimator, row.metric): row.mean for row in reckoning.one_drive("husky", source, ["batch"], [])}
     for metric in ("end", "rms"):
         assert share["batch", metric] < 1.05 * share["dead reckoning", metric]
         assert 0.1 < share["dead reckoning", metric] < 5.0

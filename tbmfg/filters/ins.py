@@ -2,7 +2,8 @@
 
 Between keyframes it mechanises every IMU step; at a keyframe it corrects with that keyframe's rows. A
 clone of the previous keyframe's pose rides along, so that a displacement (odometer) is measured between
-the two, as in the graph. Rows beyond the chi-square 99.9 % point are gated.
+the two, as in the graph. Rows beyond the chi-square 99.9 % point are gated. A row
+that tells much more than was known is linearised again where it has moved the state to.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from numba import njit
 from scipy.stats import chi2
 
 from tbmfg.filters.kalman import correct, innovation, predict
-from tbmfg.inertial.strapdown import correct_state, propagate
+from tbmfg.inertial.strapdown import correct_state, difference, propagate
 from tbmfg.problem import GATE, Problem
+from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
@@ -26,6 +28,11 @@ REOPEN = 10
 TAIL = (
     4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it
 )
+# A row that tells so much more than was known moves the state to where its own Jacobian is another; it is then
+# linearised again there. As log det S, S being what the row was expected to spread by, in its own variances.
+WIDE = np.log(10.0)
+ITERATIONS = 4
+SETTLED = 0.01  # sds
 LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
 
 
@@ -54,7 +61,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
         [k for k in parameters.free if not parameters.names[k].endswith(tuple(fixed) or ("\0",))], dtype=int
     )
     d, m, n = NAV + e, len(free), len(problem.keyframe_edges)
-    calib, clone = slice(d, d + m), slice(d + m, d + m + 6)
+    calib = slice(d, d + m)
 
     x, c = problem.prior.x.copy(), parameters.start.copy()
     P = np.zeros((d + m + 6, d + m + 6))
@@ -84,10 +91,14 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
         for rows in problem.rows:
             sensor = rows.sensor
             for r in range(starts[sensor][k], starts[sensor][k + 1]):
-                before = previous if rows.i[r] < k else x
+                binary = rows.i[r] < k
+                before = previous if binary else x
                 parts = rows.evaluate_at(before[None], x[None], c, slice(r, r + 1))
                 shut = gates[sensor] if in_a_row[sensor] < REOPEN or rows.loss == "gnc" else np.inf
+                prior = x.copy(), previous.copy(), P, c.copy()
                 P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut)
+                if logdet > WIDE and value <= shut:
+                    P = _iterate(rows, r, binary, *prior, x, previous, c, free, inputs[sensor])
                 nis[sensor][r] = value
                 cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
                 if value > shut:
@@ -122,16 +133,54 @@ def _advance(x, P, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd
     return x, P
 
 
+def _iterate(
+    rows: Rows, r: int, binary: bool, x0: Floats, previous0: Floats, P0: Floats, c0: Floats,
+    x: Floats, previous: Floats, c: Floats, free: np.ndarray, places: np.ndarray,
+) -> Floats:  # fmt: skip
+    """Covariance after row ``r``, linearised anew where it has moved ``x``, ``previous`` and ``c``, which move on in
+    place: Gauss-Newton from the prior ``.. 0``, the iterated extended Kalman filter (Bell and Cathey 1993)."""
+    P = P0
+    for _ in range(ITERATIONS):
+        parts = rows.evaluate_at((previous if binary else x)[None], x[None], c, slice(r, r + 1))
+        moved = np.concatenate(
+            [difference(x[None], x0[None])[0], (c - c0)[free], difference(previous[None], previous0[None])[0, :6]]
+        )
+        x[:], previous[:], c[:] = x0, previous0, c0
+        P, dx = _relinearised(x, previous, P0, c, *parts, free, places, moved)
+        if np.all(np.abs(dx - moved) <= SETTLED * np.sqrt(np.diag(P0))):
+            break
+    return P
+
+
 @njit(cache=True)
 def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate):
-    """Correct the state ``x``, the ``previous`` keyframe's pose and the constants ``c``, in place, by one row linearised
-    there, unless its squared normalised innovation is beyond ``gate``: covariance, that innovation, and log det S.
+    """Correct the state ``x``, the ``previous`` keyframe's pose and the constants ``c``, in place, by one row that was
+    linearised there, unless its squared normalised innovation is beyond ``gate``: covariance, that innovation, and log
+    det S."""
+    r, H = residual[0], _jacobian(P, Ji, Jj, Jc, places)
+    nis, logdet = innovation(P, H, r)
+    if not nis > gate:
+        dx, P = correct(P, H, r)
+        _move(x, previous, c, dx, free)
+    return P, nis, logdet
 
-    Errors of ``P`` are [state, free constants, clone]; ``places`` says which of the free ones the columns of Jc are,
-    -1 for known ones.
-    """
-    r, d, clone = residual[0], Ji.shape[2], len(P) - 6
-    H = np.zeros((len(r), len(P)))
+
+@njit(cache=True)
+def _relinearised(x, previous, P, c, residual, Ji, Jj, Jc, free, places, moved):
+    """The same for a row linearised where ``x``, ``previous`` and ``c`` have ``moved`` to: covariance, and the error
+    by which they are corrected."""
+    H = _jacobian(P, Ji, Jj, Jc, places)
+    dx, P = correct(P, H, residual[0] - H @ moved)
+    _move(x, previous, c, dx, free)
+    return P, dx
+
+
+@njit(cache=True)
+def _jacobian(P, Ji, Jj, Jc, places):
+    """Of one row to the errors of ``P``, [state, free constants, clone]; ``places`` says which of the free ones the
+    columns of Jc are, -1 for known ones."""
+    d, clone = Ji.shape[2], len(P) - 6
+    H = np.zeros((Ji.shape[1], len(P)))
     if Jj.shape[2] > 0:
         H[:, clone:], H[:, :d] = Ji[0, :, :6], Jj[0]
         H[:, 6:d] += Ji[0, :, 6:]  # velocity and biases of the previous keyframe are taken as the present ones
@@ -140,12 +189,16 @@ def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate):
     for column, place in enumerate(places):
         if place >= 0:
             H[:, d + place] = Jc[0, :, column]
-    nis, logdet = innovation(P, H, r)
-    if not nis > gate:
-        dx, P = correct(P, H, r)
-        x[:] = correct_state(x, dx[:d])
-        c[free] += dx[d:clone]
-        pose = np.zeros(d)
-        pose[:6] = dx[clone:]
-        previous[:] = correct_state(previous, pose)
-    return P, nis, logdet
+    return H
+
+
+@njit(cache=True)
+def _move(x, previous, c, dx, free):
+    """Correct the state, the constants and the pose of the previous keyframe, in place."""
+    d = len(x) - 6
+    clone = len(dx) - 6
+    x[:] = correct_state(x, dx[:d])
+    c[free] += dx[d:clone]
+    pose = np.zeros(d)
+    pose[:6] = dx[clone:]
+    previous[:] = correct_state(previous, pose)
