@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from tbmfg import cli, doctor, pipeline
 from tbmfg.cli import options, terminal
-from tbmfg.cli.terminal import Terminal
+from tbmfg.cli.terminal import Level, Terminal
 from tbmfg.errors import EstimationError, LogError, TbmfgError, reason
 from tbmfg.rig import parse_rig
 from tbmfg.state import Calibrated, Counts, Result, Trajectory
@@ -286,6 +286,22 @@ def test_the_bar_shows_stage_and_what_remains(monkeypatch):
         assert "left" in drawn.getvalue()
         assert bool(re.search(r"\x1b\[[\d;]*3\dm", drawn.getvalue())) is colour
         monkeypatch.setenv("NO_COLOR", "1")
+
+
+def test_the_first_run_says_what_it_waits_for(monkeypatch, tmp_path):
+    screen = io.StringIO()
+    screen.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for level, said in ((Level.error, False), (Level.warning, True)):
+        with Terminal(level).progress("reading"):
+            pass
+        assert ("first run here" in screen.getvalue()) is said
+    (tmp_path / "kalman.predict.nbi").touch()
+    screen.truncate(0)
+    with Terminal().progress("reading"):
+        pass
+    assert "first run" not in screen.getvalue()
 
 
 def test_colour_is_for_terminals(monkeypatch):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 from typing import IO, Any
 
 import typer
@@ -82,6 +83,8 @@ class Terminal:
         """A callback that shows stage (at the beginning ``first``) and done fraction, None where nobody would see it:
         a bar on a terminal, and from the level info on a line for every stage that has ended."""
         bar = self.level != Level.error and sys.stderr.isatty()
+        if bar and not _compiled():
+            typer.echo("first run here: what has to be fast is compiled, which takes a minute or two", err=True)
         lines = self.level in (Level.info, Level.debug)
         with _bar(first) if bar else _nothing() as draw, _stages(first) if lines else _nothing() as tell:
             shown = [show for show in (draw, tell) if show]
@@ -121,6 +124,13 @@ def number(value: float | tuple[float, ...] | None) -> str:
     if value is None:
         return "-"
     return " ".join(f"{x:.4g}" for x in value) if isinstance(value, list | tuple) else f"{value:.4g}"
+
+
+def _compiled() -> bool:
+    """Whether numba has compiled tbmfg before; yes also where it keeps that in a place that only numba knows."""
+    package = Path(__file__).parents[1]
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or package)
+    return not os.access(folder, os.W_OK) or next(folder.rglob("*.nbi"), None) is not None
 
 
 @contextmanager
