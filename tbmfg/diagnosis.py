@@ -138,8 +138,9 @@ def gated_in_words(stretches: list[Interval], origin_ns: int) -> list[str]:
         own = [s for s in stretches if s.sensor == sensor]
         longest = max(own, key=lambda s: s.end_ns - s.start_ns)
         start, end = (longest.start_ns - origin_ns) * 1e-9, (longest.end_ns - origin_ns) * 1e-9
+        which = "from" if len(own) == 1 else f"{len(own)} times, the longest from"
         lines.append(
-            f"{sensor}: gated for {STRETCH} or more rows on end {len(own)} times, the longest {start:.1f}-{end:.1f} s; "
-            "what it says there contradicts the rest"
+            f"{sensor}: gated for {STRETCH} or more rows on end {which} {start:.1f} to {end:.1f} s; what it says there "
+            "contradicts the rest"
         )
     return lines

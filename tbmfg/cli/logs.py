@@ -27,7 +27,7 @@ def info(
     Examples:
       tbmfg info drive.mcap
       tbmfg info standing.mcap --allan --rig tbm        noise of the IMU beside what the rig says
-      tbmfg info drive.mcap --json | jq .topics[].rate_hz
+      tbmfg info drive.mcap --json | jq '.topics[].rate_hz'
     """
     from tbmfg.mcap import describe, info_text
 

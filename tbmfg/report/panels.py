@@ -128,7 +128,7 @@ def log_ticks(low: float, high: float) -> dict[str, Any]:
         "type": "log",
         "range": [float(first), float(last)],
         "tickvals": shown.tolist(),
-        "ticktext": [f"{tick:.4g}" for tick in shown],
+        "ticktext": [f"{tick:.10g}" for tick in shown],
     }
 
 
