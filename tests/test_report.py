@@ -251,7 +251,9 @@ def test_without_truth_the_report_says_so():
     made = Report("toy", "", EPOCH_NS)
     made.add(Result("batch", trajectory()), SUMMARY | {"metrics": None, "truth": None}, None)
     assert "no truth" in findings(made)[0].lines[-1]
-    assert "Errors against the truth" not in made.html()
+    page = made.html()
+    assert "Errors against the truth" not in page
+    assert "Without a truth there are no errors to set side by side" in page
 
 
 # ---- the page ----

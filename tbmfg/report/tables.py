@@ -60,6 +60,8 @@ def comparison(report: Report, pen: dict[str, Pen]) -> str:
             "it where it lies by chance in 99 % of runs as correlated as this one. Over its Cramer-Rao bound, from the "
             "whole log or for a causal trajectory from the past alone, an error is about 1 where nothing is lost."
         )
+    else:
+        notes.append("Without a truth there are no errors to set side by side; how sure each says it is stands above.")
     return table(header, body, "stacked") + f"<p class=note>{escape(' '.join(notes))}</p>"
 
 
