@@ -132,7 +132,9 @@ def space(report: Report, pen: dict[str, Pen]) -> Figure:
     if (ratio <= THINNEST).any():
         figure.caption += " Not in equal scales: what is flat or narrow is stretched."
     scene |= {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True))}
-    figure.layout = layout(560, scene={**scene, "camera": {"eye": {"x": 0.9, "y": -1.5, "z": 0.9}}})
+    figure.layout = layout(
+        560, scene={**scene, "camera": {"eye": {"x": 1.15, "y": -1.85, "z": 1.05}, "center": {"z": -0.15}}}
+    )
     figure.layout["margin"] = {"l": 0, "r": 0, "t": 45, "b": 0}
     return figure
 
