@@ -64,7 +64,7 @@ def make(
     o3d = open3d()
     blur, cloud, waiting = SurfelMap(THICK_M, full=np.inf), o3d.geometry.PointCloud(), []
     for number, (share, points_n) in enumerate(scans_in_n(log, rig, path, lidar)):
-        blur.add(points_n)
+        blur.add(points_n, np.zeros(3))
         waiting.append(points_n)
         if len(waiting) == MANY:
             cloud, waiting = _thinned(o3d, cloud, waiting), []

@@ -76,7 +76,7 @@ def test_ghosts_show(made, tmp_path):
         drifting = path.position_n + shift * np.linspace(0, 1, 61)[:, None] * [0.0, 1.0, 1.0]
         blur = mapping.SurfelMap(mapping.THICK_M, full=np.inf)
         for _, points in mapping.scans_in_n(read, rig, replace(path, position_n=drifting)):
-            blur.add(points)
+            blur.add(points, np.zeros(3))
         sharp.append(mapping.sharpness(blur))
     assert sharp[1].thickness_m > 1.3 * sharp[0].thickness_m
     assert sharp[1].entropy > sharp[0].entropy + 0.2

@@ -176,7 +176,7 @@ class Odometry:
 
     def _extend(self, R: Floats, p: Floats, points: Floats, dense: Floats) -> None:
         self.kiss.local_map.update(dense, matrix(R, p))
-        self.planes.add(points @ R.T + p)
+        self.planes.add(points @ R.T + p, p)
         if self.scans % FORGET_EVERY == 0:
             self.planes.keep_near(p, self.sensor.max_range)
 
