@@ -19,7 +19,7 @@ from tbmfg.measure import gyro_frame
 from tbmfg.prepare.samples import imu_steps
 from tbmfg.results import read_result_npz, refuse_existing_file
 from tbmfg.rig import Lidar, Rig, load_rig
-from tbmfg.state import Trajectory
+from tbmfg.state import Result, Trajectory
 from tbmfg.timeseries import Floats, Log, seconds
 
 FORMATS = (".ply", ".pcd")
@@ -28,6 +28,7 @@ VOXEL_M = 0.05
 THICK_M = 0.25  # voxels that the sharpness is judged in
 LEAST = 20  # points of such a voxel
 NORMAL_M = 0.3  # neighbourhood of a normal
+SKETCH_M, SKETCH_SCANS, SKETCH_POINTS = 0.2, 600, 5000  # of a sketch: a point a voxel; most scans, most points of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +83,29 @@ def make(
     return sharpness(blur), len(points)
 
 
-def scans_in_n(log: Log, rig: Rig, path: Trajectory, name: str | None = None) -> Iterator[tuple[float, Floats]]:
-    """Share of the log done, and the points (k, 3) in n of one LiDAR's scans, each from its own pose.
+def sketch(log: Log, rig: Rig, result: Result) -> tuple[Floats | None, str]:
+    """The first LiDAR's map along the best trajectory of ``result``, (k, 3) m in n, one point in every cube of 0.2 m of
+    scans spread evenly over the log, and in words what it is; None where no scan lies within it."""
+    lidar = next((sensor for sensor in rig.of_kind("lidar").values() if sensor.topic in log.clouds), None)
+    if lidar is None:
+        return None, ""
+    every = -(-len(log.clouds[lidar.topic]) // SKETCH_SCANS)
+    points_n, scans = np.zeros((0, 3)), 0
+    for _, scan in scans_in_n(log, rig, result.smoothed or result.trajectory, every=every):
+        points_n = np.vstack([points_n, scan[:: -(-len(scan) // SKETCH_POINTS)]])
+        points_n = points_n[np.unique(np.floor(points_n / SKETCH_M).astype(np.int64), axis=0, return_index=True)[1]]
+        scans += 1
+    if not scans:
+        return None, ""
+    label = f"the map along {result.estimator}, of {scans} scans a point in every cube of {SKETCH_M:g} m"
+    return points_n, label
+
+
+def scans_in_n(
+    log: Log, rig: Rig, path: Trajectory, name: str | None = None, every: int = 1
+) -> Iterator[tuple[float, Floats]]:
+    """Share of the log done, and the points (k, 3) in n of one LiDAR's scans, of ``every`` so many one, each
+    point from its own pose.
 
     Attitude between keyframes by gyro, position by the cubic through positions and velocities.
     """
@@ -101,6 +123,8 @@ def scans_in_n(log: Log, rig: Rig, path: Trajectory, name: str | None = None) ->
     stamps_s = seconds(source.t_ns, steps.t0_ns) - sensor.clock_offset
     period_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.1
     for k, (t_ns, fields) in enumerate(source):
+        if k % every:
+            continue
         scan = clouds.read(t_ns, fields, sensor, period_s)
         t_s = stamps_s[k] + (np.zeros(len(scan.points)) if scan.after_s is None else scan.after_s)
         inside = (t_s >= key_s[0]) & (t_s <= key_s[-1])

@@ -27,7 +27,7 @@ from tbmfg.results import (
 )
 from tbmfg.rig import Imu, Rig, dump_rig, load_rig, override, parse_rig
 from tbmfg.state import Calibrated, Result, Truth
-from tbmfg.timeseries import NS, Log
+from tbmfg.timeseries import NS, Floats, Log
 
 if TYPE_CHECKING:
     from tbmfg.bounds import Bounds
@@ -146,6 +146,14 @@ class Session:
             assumed=self.assumed,
         )
 
+    def sketch(self, result: Result) -> tuple[Floats | None, str]:
+        """The map that the scans make along ``result``, (k, 3) m in n, and what it is; None where there are none."""
+        if not self.log.clouds:
+            return None, ""
+        from tbmfg.mapping import sketch
+
+        return sketch(self.log, self.prepared.rig, result)
+
     def _deviation(self, result: Result) -> tuple[dict[str, Any], list[str]]:
         """What the dual-coordinate method says of a machine with a laser, {"deviation": ...}, nothing of others; and
         which of its angles are known too poorly for that."""
@@ -250,12 +258,14 @@ def run_result(
     session = open_session(log_path, progress=progress, **options)
     result, summary = session.estimate(estimator, progress)
     if output is not None:
-        text = None
+        text, (map_n, label) = None, session.sketch(result)
         if report:
             told = session.report()
             told.add(result, summary, session.truth(result))
+            told.map_n, told.map_label = map_n, label
             text = told.html()
-        write_result(output, result, summary, dump_rig(session.prepared.rig), report=text, force=force)
+        rig = dump_rig(session.prepared.rig)
+        write_result(output, result, summary, rig, report=text, map_n=map_n, force=force)
     if into is not None:
         from tbmfg.mcap import write_into
 
@@ -306,8 +316,11 @@ def compare(
             summaries[name] = report.summaries[name] = {"not_run": reason}
         elif output is not None:
             report.add(result, summaries[name], session.truth(result))
+            map_n, label = session.sketch(result)
+            if report.map_n is None:
+                report.map_n, report.map_label = map_n, label
             rig = dump_rig(session.prepared.rig)
-            write_result(output / name, result, summaries[name], rig, force=force)
+            write_result(output / name, result, summaries[name], rig, map_n=map_n, force=force)
     if all("not_run" in summary for summary in summaries.values()):
         reasons = "; ".join(f"{name}: {summary['not_run']}" for name, summary in summaries.items())
         raise TbmfgError(f"{session.log_path}: none ran: {reasons}")

@@ -65,10 +65,11 @@ def write_result(
     rig_yaml: str,
     *,
     report: str | None = None,
+    map_n: Floats | None = None,
     force: bool = False,
 ) -> None:
     """Write every file of ``result`` to the folder ``output``, a path or a URL, which is made where it is missing;
-    ``report`` is a page.
+    ``report`` is a page, ``map_n`` (k, 3) m a map for result.mcap.
 
     The files are written elsewhere and come to their names when all are complete.
     """
@@ -83,6 +84,7 @@ def write_result(
             result.trajectory,
             diagnostics=_diagnostics(result),
             intervals=result.intervals,
+            map_n=map_n,
         )
         (folder / "rig.yaml").write_text(rig_yaml, "utf-8")
         if report is not None:

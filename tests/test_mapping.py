@@ -67,6 +67,19 @@ def test_map_along_the_estimate_is_as_sharp(made, tmp_path):
     assert abs(thick[1] / thick[0] - 1.0) < 0.1
 
 
+def test_a_result_carries_the_map(made, tmp_path):
+    log, _ = made
+    run(str(log), estimator="ins", output=tmp_path / "ins", report=True)
+    [(_, fields)] = read_log(tmp_path / "ins" / "result.mcap").clouds["/tbmfg/map"]
+    points = np.column_stack([fields[axis] for axis in "xyz"])
+    cubes = np.unique(np.floor(points.astype(float) / mapping.SKETCH_M + 1e-6), axis=0)
+    assert len(points) > 1000
+    assert len(cubes) > 0.99 * len(points)  # one point in each, but for those that float32 rounds into the next
+    page = (tmp_path / "ins" / "report.html").read_text("utf-8")
+    assert "the map along ins, of " in page
+    assert len(page) < 15e6
+
+
 def test_ghosts_show(made, tmp_path):
     log, folder = made
     read = read_log(log)

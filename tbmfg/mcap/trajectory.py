@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from tbmfg.geometry import log_so3, matrix_from_quat, skew
+from tbmfg.mcap import clouds
 from tbmfg.mcap.cdr import CdrWriter
 from tbmfg.mcap.layouts import LAYOUTS, ONE_TRANSFORM
 from tbmfg.mcap.streams import TRANSFORMS
@@ -19,7 +20,7 @@ from tbmfg.timeseries import Floats, seconds
 ODOMETRY = "nav_msgs/msg/Odometry"
 PATH = "nav_msgs/msg/Path"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
-ODOMETRY_TOPIC, PATH_TOPIC = "/tbmfg/odometry", "/tbmfg/path"
+ODOMETRY_TOPIC, PATH_TOPIC, MAP_TOPIC = "/tbmfg/odometry", "/tbmfg/path", "/tbmfg/map"
 OK, WARN = 0, 1  # levels of diagnostic_msgs/DiagnosticStatus
 
 
@@ -29,6 +30,7 @@ def write_trajectory(
     *,
     diagnostics: Mapping[str, str] | None = None,
     intervals: Sequence[Interval] = (),
+    map_n: Floats | None = None,
     frame_id: str = "map",
     child_frame_id: str = "base_link",
     compression: Compression = "zstd",
@@ -36,8 +38,8 @@ def write_trajectory(
     """Write nav_msgs/Odometry, all poses as one nav_msgs/Path, the same to /tf, and what happened to /diagnostics.
 
     ``diagnostics`` come as one status at the start; ``intervals`` as a status of their sensor that warns from the start
-    to the end of each. ``frame_id`` is n, ``child_frame_id`` is b. Log times are the stamps. Raises LogError where the
-    file cannot be written.
+    to the end of each. ``map_n`` (k, 3) m comes as one PointCloud2 at the start. ``frame_id`` is n, ``child_frame_id``
+    is b. Log times are the stamps. Raises LogError where the file cannot be written.
     """
     types, streams = trajectory_messages(trajectory, frame_id, child_frame_id)
     strings = {"frame_id": frame_id, "child_frame_id": child_frame_id}
@@ -47,6 +49,11 @@ def write_trajectory(
     if len(trajectory) and (diagnostics or intervals):
         types["/diagnostics"] = DIAGNOSTICS
         streams.append(_diagnostics(int(trajectory.t_ns[0]), diagnostics or {}, intervals))
+    if len(trajectory) and map_n is not None:
+        start_ns = int(trajectory.t_ns[0])
+        fields = {axis: map_n[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
+        types[MAP_TOPIC] = clouds.TYPE
+        streams.append([(start_ns, MAP_TOPIC, clouds.encode_cloud(start_ns, frame_id, fields))])
     write_messages(path, types, heapq.merge(*streams, key=lambda message: message[0]), {}, compression)
 
 

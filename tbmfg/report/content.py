@@ -46,7 +46,8 @@ class Report:
     """Everything that a report shows. Times are seconds from ``t0_ns``, the first IMU sample.
 
     ``found`` and ``assumed`` are the warnings that the log and the rig, not an estimator, gave rise to; ``stamps_s``
-    the recorded stamps by sensor; ``map_n`` (k, 3) m points of a map in n. ``summaries`` are as compare.json has them.
+    the recorded stamps by sensor; ``map_n`` (k, 3) m points of a map in n, and what they are. ``summaries`` are as
+    compare.json has them.
     """
 
     title: str
@@ -56,6 +57,7 @@ class Report:
     found: Sequence[str] = ()
     assumed: Sequence[str] = ()
     map_n: Floats | None = None
+    map_label: str = "the map"
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     tracks: list[Track] = field(default_factory=list)
     innovations: dict[str, dict[str, Innovations]] = field(default_factory=dict)

@@ -104,11 +104,11 @@ def space(report: Report, pen: dict[str, Pen]) -> Figure:
     figure = Figure("In space", "Drag to turn, scroll to zoom.")
     middle = report.tracks[0].path.position_n.mean(axis=0)
     shift = np.where(np.abs(middle) > FAR, np.round(middle, -2), 0.0)
-    if report.map_n is not None and len(report.map_n):
+    if report.map_n is not None:
         every = -(-len(report.map_n) // MAP_POINTS)
         points = report.map_n[::every] - shift
-        share = f", one in {every} of its {len(report.map_n)} points" if every > 1 else ""
-        figure.caption += f" Grey: the map{share}."
+        share = f"; one in {every} of its {len(report.map_n)} points is drawn" if every > 1 else ""
+        figure.caption += f" Grey: {report.map_label}{share}."
         marker = {"size": 1.2, "color": "#9a9a9a"}
         figure.data.append(_spatial(points) | {"mode": "markers", "marker": marker, "name": "map", "hoverinfo": "skip"})
     curves = [(pen[track.label], track.path.position_n) for track in report.tracks]
