@@ -24,5 +24,6 @@ BENCHMARKS = {
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",
+    "scans": "benchmarks.scans",
     "papers": "benchmarks.papers",
 }

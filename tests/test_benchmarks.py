@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, gyrocompass, runs, speed
+from benchmarks import accuracy, gate, gyrocompass, runs, scans, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -275,3 +275,25 @@ def test_script_and_smoother_solve_the_same_problem(tmp_path):
     assert min(stages) > 0
     assert sum(stages[:-1]) <= stages[-1]
     assert found["tbmfg", "total / bare"].bound == (None, speed.LIMIT)
+
+
+def test_scans_that_are_lost_and_flagged():
+    truth = np.tile(np.eye(4), (10, 1, 1))
+    truth[:, 0, 3] = 0.5 * np.arange(10)
+
+    def register(points, t_s):
+        T = truth[int(t_s)].copy()
+        T[1, 3] = 0.4 if t_s >= 6 else 0.0
+        return T, t_s in (2, 7)
+
+    found = scans._run(register, iter([np.ones((5, 3))] * 10), np.arange(10.0), truth)
+    assert (found["lost"], found["late"]) == (6, 1)
+    assert found["flagged"] == pytest.approx(100 / 6)
+    straight = scans._run(
+        lambda points, t_s: (truth[int(t_s)], False), iter([np.ones((5, 3))] * 10), np.arange(10.0), truth
+    )
+    assert (straight["lost"], straight["late"], straight["flagged"]) == (10, 0, 0)
+    rows = {(row.estimator, row.metric): row for row in scans._rows("x", {"ours": [straight], "KISS-ICP": [found]})}
+    assert rows["ours", "lost"].inside
+    assert rows["ours", "late"].inside
+    assert ("KISS-ICP", "late") not in rows

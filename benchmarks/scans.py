@@ -1,0 +1,154 @@
+"""LiDAR odometry by the scans alone, beside the libraries, on a recording (BALM, KITTI; recordings not part of this).
+
+Every method takes the same scans in the same order, with its own constant-velocity guess. Medians over the repetitions:
+
+lost       first scan whose pose is more than 0.3 m or 5 degrees from the reference, the number of scans for none
+flagged    share of the good scans that were flagged, of the methods that flag
+late       scans from the first lost one to the next flag, 0 where none is lost
+cost       CPU time of a scan, its median over the scans
+ratio      of that to bare KISS-ICP at the voxel of ours, in the same run
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.rows import Row
+from tbmfg.timeseries import Floats
+
+VOXELS_M = (0.2, 0.4, 0.8)
+LOST_M, LOST_DEG = 0.3, 5.0
+OURS, BARE = "ours", "KISS-ICP"
+Register = Callable[[Floats, float], tuple[Floats, bool]]  # points (n, 3) and time s: pose (4, 4), and whether in doubt
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", type=Path, metavar="NPZ", help="the packed scans")
+    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="(5)")
+    parser.add_argument("--scans", type=int, default=None, metavar="N", help="only the first (all)")
+
+
+def measure(given: argparse.Namespace) -> list[Row]:
+    """Rows of every method; those of poses only where the recording has a reference."""
+    from datasets.recordings import read_npz
+    from datasets.recordings.scans import packed
+
+    arrays = read_npz(given.source)
+    count = min(given.scans or len(arrays["scan_t"]), len(arrays["scan_t"]))
+    stamps_s, reference = arrays["scan_t"][:count].astype(float), arrays.get("ref_T")
+    source = packed(arrays, np.arange(count))
+    scenario, runs = given.source.resolve().parent.name, {}
+    for _ in range(given.repeats):
+        for name, make in methods().items():
+            runs.setdefault(name, []).append(_run(make(), _points(source), stamps_s, reference))
+    return list(_rows(scenario, runs))
+
+
+def methods() -> dict[str, Callable[[], Register]]:
+    """Ours at its default voxel, bare KISS-ICP at the same, and the libraries at three voxels."""
+    from tbmfg.rig import Lidar
+
+    own = Lidar(topic="/points")
+    found: dict[str, Callable[[], Register]] = {OURS: lambda: _ours(own), BARE: lambda: _kiss(own.voxel)}
+    for voxel in VOXELS_M:
+        found[f"KISS-ICP {voxel}"] = lambda voxel=voxel: _kiss(voxel)
+        found[f"small_gicp {voxel}"] = lambda voxel=voxel: _gicp(voxel)
+    return found
+
+
+def _ours(sensor) -> Register:
+    from tbmfg.lidar.clouds import Scan
+    from tbmfg.lidar.motion import Blind
+    from tbmfg.lidar.odometry import Odometry, matrix
+
+    odometry = Odometry(sensor, Blind())
+
+    def register(points: Floats, t_s: float) -> tuple[Floats, bool]:
+        pose = odometry.register(Scan(0, points, None, 0, 0, 0), t_s)
+        return matrix(pose.R, pose.p), not pose.healthy
+
+    return register
+
+
+def _kiss(voxel: float) -> Register:
+    from kiss_icp.config import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    config = load_config(None)
+    config.mapping.voxel_size = voxel
+    kiss = KissICP(config)
+
+    def register(points: Floats, t_s: float) -> tuple[Floats, bool]:
+        kiss.register_frame(points, np.zeros(0))  # no times: no compensation
+        return kiss.last_pose.copy(), False
+
+    return register
+
+
+def _gicp(voxel: float) -> Register:
+    """Generalised ICP onto a map of Gaussian voxels; points are thinned to half a voxel."""
+    import small_gicp
+
+    planes, T, step = small_gicp.GaussianVoxelMap(voxel), np.eye(4), np.eye(4)
+
+    def register(points: Floats, t_s: float) -> tuple[Floats, bool]:
+        nonlocal T, step
+        source, _ = small_gicp.preprocess_points(points, voxel / 2)
+        if planes.size():
+            found = small_gicp.align(planes, source, T @ step).T_target_source
+            T, step = found, np.linalg.inv(T) @ found
+        planes.insert(source, T)
+        return T, False
+
+    return register
+
+
+def _points(source) -> Iterator[Floats]:
+    for _, fields in source:
+        points = np.column_stack([fields[axis] for axis in "xyz"]).astype(float)
+        yield points[np.einsum("ni,ni->n", points, points) > 0.25]
+
+
+def _run(register: Register, scans: Iterator[Floats], stamps_s: Floats, reference: Floats | None) -> dict[str, float]:
+    poses, doubts, cost_s = [], [], []
+    for points, t_s in zip(scans, stamps_s, strict=True):
+        started = time.process_time()
+        T, doubt = register(points, t_s)
+        cost_s.append(time.process_time() - started)
+        poses.append(T)
+        doubts.append(doubt)
+    out = {"cost": 1e3 * float(np.median(cost_s)), "scans": float(len(poses))}
+    if reference is None:
+        return out | {"flagged": 100.0 * float(np.mean(doubts))}
+    off = np.linalg.inv(np.linalg.inv(reference[0]) @ reference[: len(poses)]) @ np.linalg.inv(poses[0]) @ poses
+    turn = np.degrees(np.arccos(np.clip((np.einsum("nii->n", off[:, :3, :3]) - 1) / 2, -1.0, 1.0)))
+    lost = np.flatnonzero((np.linalg.norm(off[:, :3, 3], axis=1) > LOST_M) | (turn > LOST_DEG))
+    first = int(lost[0]) if len(lost) else len(poses)
+    flags = np.flatnonzero(doubts)
+    after = flags[flags >= first]
+    late = 0 if first == len(poses) else (int(after[0]) if len(after) else len(poses)) - first
+    return out | {"lost": float(first), "late": float(late), "flagged": 100.0 * float(np.mean(doubts[:first]))}
+
+
+def _rows(scenario: str, runs: dict[str, list[dict[str, float]]]) -> Iterator[Row]:
+    bare = np.median([run["cost"] for run in runs[BARE]])
+    medians = {
+        name: {key: float(np.median([run[key] for run in repeated])) for key in repeated[0]}
+        for name, repeated in runs.items()
+    }
+    libraries = [found["lost"] for name, found in medians.items() if name != OURS and "lost" in found]
+    bounds = {"flagged": (None, 5.0), "late": (None, 2.0), "ratio": (None, 1.5)}
+    if libraries:
+        bounds["lost"] = (min(max(libraries) + 1.0, medians[OURS]["scans"]), None)
+    for name, found in medians.items():
+        found["ratio"] = found["cost"] / bare
+        for metric, unit in (("lost", "scan"), ("flagged", "%"), ("late", "scans"), ("cost", "ms"), ("ratio", "")):
+            if metric not in found or (metric in ("flagged", "late") and name != OURS):
+                continue
+            bound = bounds.get(metric) if name == OURS else None
+            yield Row(scenario, name, metric, unit, found[metric], None, len(runs[name]), bound)
