@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import TypeVar
+
+from tbmfg import workers
 
 Job = TypeVar("Job")
 Done = TypeVar("Done")
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-
 
 def run_all(function: Callable[[Job], Done], jobs: list[Job], processes: int, title: str) -> list[Done]:
-    """``function`` of every job, in the order of the jobs; a bar on a terminal and nothing in a pipe.
-
-    The processes are started afresh, so that the thread limits are read by whatever they load.
-    """
-    pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=multiprocessing.get_context("spawn"))
-    with _one_thread(), _bar(title, len(jobs)) as step:
-        try:
-            futures = [pool.submit(function, job) for job in jobs]
-            for future in as_completed(futures):
-                future.result()
-                step()
-        finally:
-            pool.shutdown(cancel_futures=True)
-    return [future.result() for future in futures]
+    """``function`` of every job, in the order of the jobs; a bar on a terminal and nothing in a pipe. The first job
+    that raises ends it."""
+    done: dict[int, Done] = {}
+    with (
+        workers.processes(min(processes, len(jobs))) as pool,
+        closing(workers.run(partial(_of_numbered, function), enumerate(jobs), pool)) as ended,
+        _bar(title, len(jobs)) as step,
+    ):
+        for (number, _), future in ended:
+            done[number] = future.result()
+            step()
+    return [done[number] for number in range(len(jobs))]
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _of_numbered(function: Callable[[Job], Done], job: tuple[int, Job]) -> Done:
+    return function(job[1])
 
 
 @contextmanager
