@@ -35,49 +35,74 @@ def assemble(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, np.nd
     out: list = []
     for binary in (False, True):
         chosen = [blk for blk in blocks if (blk.A_j is not None) == binary and len(blk.i)]
-        width = (2 * d if binary else d) + m + 1
-        parts, owner = [np.zeros((0, width))], [np.zeros(0, dtype=int)]
+        count = np.zeros(n, dtype=np.int64)
         for blk in chosen:
-            states = (blk.A_i, blk.A_j) if binary else (blk.A_i,)
-            rows = np.concatenate([*states, blk.A_c, blk.b[:, :, None]], axis=2)
-            parts.append(rows.reshape(-1, width))
-            owner.append(np.repeat(blk.i, blk.b.shape[1]))
-        flat, by = np.concatenate(parts), np.concatenate(owner)
-        order = np.argsort(by, kind="stable")
-        out += [flat[order], np.searchsorted(by[order], np.arange(n + 1))]
+            count += blk.b.shape[1] * np.bincount(blk.i, minlength=n)
+        start = np.concatenate([[0], np.cumsum(count)])
+        rows, place = np.zeros((start[-1], (2 * d if binary else d) + m + 1)), start[:-1].copy()
+        for blk in chosen:
+            parts = (blk.A_i, blk.A_j if binary else blk.A_i, blk.A_c, blk.b)
+            _place(rows, place, blk.i, binary, *(np.ascontiguousarray(part) for part in parts))
+        out += [rows, start]
     return out[0], out[1], out[2], out[3]
+
+
+@njit(cache=True)
+def _place(rows, place, i, binary, A_i, A_j, A_c, b):
+    """Write a block's rows where ``place`` says that those of their keyframes go on, and move it."""
+    d, m = A_i.shape[2], A_c.shape[2]
+    for r in range(len(i)):
+        for a in range(b.shape[1]):
+            row = rows[place[i[r]]]
+            place[i[r]] += 1
+            for q in range(d):
+                row[q] = A_i[r, a, q]
+            if binary:
+                for q in range(d):
+                    row[d + q] = A_j[r, a, q]
+            for q in range(m):
+                row[len(row) - 1 - m + q] = A_c[r, a, q]
+            row[len(row) - 1] = b[r, a]
 
 
 @njit(cache=True)
 def _triangularise(W: np.ndarray, rows: int, columns: int) -> None:
     """Householder QR of W[:rows, :columns] in place; it turns all columns, and the sign of R's diagonal is free."""
     width = W.shape[1]
-    w = np.empty(width)
+    w, below = np.empty(width), np.empty(rows, dtype=np.int64)
     for j in range(min(columns, rows)):
-        square = 0.0
-        for i in range(j, rows):
-            square += W[i, j] * W[i, j]
-        if square == 0.0:
+        count, square = 0, W[j, j] * W[j, j]
+        for i in range(j + 1, rows):
+            if W[i, j] != 0.0:
+                below[count] = i
+                count += 1
+                square += W[i, j] * W[i, j]
+        if count == 0:
             continue
         alpha = -np.sqrt(square) if W[j, j] > 0 else np.sqrt(square)
         v0 = W[j, j] - alpha
         beta = -1.0 / (alpha * v0)  # 2 / |v|^2
         for q in range(j + 1, width):
             w[q] = v0 * W[j, q]
-        for i in range(j + 1, rows):
-            a = W[i, j]
-            if a != 0.0:
-                for q in range(j + 1, width):
-                    w[q] += a * W[i, q]
+        fours = count - count % 4  # rows at a time: they are short, and w is read and written once for all
+        for n in range(0, fours, 4):
+            i0, i1, i2, i3 = below[n], below[n + 1], below[n + 2], below[n + 3]
+            a0, a1, a2, a3 = W[i0, j], W[i1, j], W[i2, j], W[i3, j]
+            for q in range(j + 1, width):
+                w[q] += a0 * W[i0, q] + a1 * W[i1, q] + a2 * W[i2, q] + a3 * W[i3, q]
+        for n in range(fours, count):
+            a = W[below[n], j]
+            for q in range(j + 1, width):
+                w[q] += a * W[below[n], q]
         for q in range(j + 1, width):
             w[q] *= beta
             W[j, q] -= v0 * w[q]
-        for i in range(j + 1, rows):
+        for n in range(count):
+            i = below[n]
             a = W[i, j]
-            if a != 0.0:
-                for q in range(j + 1, width):
-                    W[i, q] -= a * w[q]
-                W[i, j] = 0.0
+            for q in range(j + 1, width):
+                W[i, q] -= a * w[q]
+            W[i, j] = 0.0
         W[j, j] = alpha
 
 
@@ -229,9 +254,9 @@ class Elimination:
 
 def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
     """Eliminate n keyframes of dimension d with a border of m constants; blocks in any order."""
-    U, u_start, B, b_start = assemble(blocks, n, d, m)
-    conditionals, border = _eliminate(U, u_start, B, b_start, n, d, m)
-    return Elimination(conditionals, border, *lengths(blocks, n, d, m), n, d, m)
+    rows = assemble(blocks, n, d, m)
+    conditionals, border = _eliminate(*rows, n, d, m)
+    return Elimination(conditionals, border, *_lengths(*rows, n, d, m), n, d, m)
 
 
 def newest(blocks: list[Block], n: int, d: int, m: int) -> Floats:
@@ -239,26 +264,34 @@ def newest(blocks: list[Block], n: int, d: int, m: int) -> Floats:
     return _newest(*assemble(blocks, n, d, m), n, d, m)
 
 
-def marginal(blocks: list[Block], d: int, m: int) -> Block:
-    """What keyframe 0 of two leaves on keyframe 1 and the constants, as rows on the latter (its keyframe 0), from all
-    rows on keyframe 0; those on keyframe 1 alone are left where they are."""
-    on_first = [blk for blk in blocks if blk.A_j is not None] + [
+def marginal(blocks: list[Block], n: int, d: int, m: int) -> Block:
+    """What the keyframes before the last of n leave on that and the constants, as rows on the latter (its keyframe 0),
+    from all rows on them; those on the last alone are left where they are."""
+    on_others = [blk for blk in blocks if blk.A_j is not None] + [
         Block(blk.i[own], blk.A_i[own], None, blk.A_c[own], blk.b[own])
         for blk in blocks
-        if blk.A_j is None and (own := blk.i == 0).any()
+        if blk.A_j is None and (own := blk.i < n - 1).any()
     ]
-    conditionals, border = _eliminate(*assemble(on_first, 2, d, m), 2, d, m)
+    conditionals, border = _eliminate(*assemble(on_others, n, d, m), n, d, m)
     rows = np.zeros((d + m, d + m + 1))
-    rows[:d, :d], rows[:d, d:], rows[d:, d:] = conditionals[1, :, :d], conditionals[1, :, 2 * d :], border
+    rows[:d, :d], rows[:d, d:], rows[d:, d:] = conditionals[-1, :, :d], conditionals[-1, :, 2 * d :], border
     return Block(np.zeros(1, dtype=int), rows[None, :, :d], None, rows[None, :, d:-1], rows[None, :, -1])
 
 
 def lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:
     """Length of every column, keyframes (n, d) and constants (m,)."""
-    squares, border = np.zeros((n, d)), np.zeros(m)
-    for block in blocks:
-        np.add.at(squares, block.i, np.sum(block.A_i**2, axis=1))
-        if block.A_j is not None:
-            np.add.at(squares, block.i + 1, np.sum(block.A_j**2, axis=1))
-        border += np.sum(block.A_c**2, axis=(0, 1))
-    return np.sqrt(squares), np.sqrt(border)
+    return _lengths(*assemble(blocks, n, d, m), n, d, m)
+
+
+@njit(cache=True)
+def _lengths(U, u_start, B, b_start, n, d, m):
+    squares, border = np.zeros((n + 1, d)), np.zeros(m)
+    for rows, start, ends in ((U, u_start, 1), (B, b_start, 2)):
+        for k in range(n):
+            for r in range(start[k], start[k + 1]):
+                for end in range(ends):
+                    for q in range(d):
+                        squares[k + end, q] += rows[r, end * d + q] ** 2
+                for q in range(m):
+                    border[q] += rows[r, ends * d + q] ** 2
+    return np.sqrt(squares[:n]), np.sqrt(border)

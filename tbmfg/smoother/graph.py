@@ -32,7 +32,7 @@ class States:
 def imu_graph(problem: Problem, x: Floats) -> gtsam.NonlinearFactorGraph:
     """CombinedImuFactor between neighbours, preintegrated at the biases of ``x`` (n, 21 + e)."""
     graph = gtsam.NonlinearFactorGraph()
-    base = _parameters(problem, 0.0, 0.0)
+    base = noise_of(problem)
     for k in range(len(problem.keyframe_edges) - 1):
         pim = preintegrate(problem, k, x[k], base)
         graph.add(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), pim))
@@ -48,14 +48,15 @@ def preintegrate(
     dt = np.diff(inertial.steps.edges_s[rows.start : rows.stop + 1])
     # steps that stand in for lost samples: their extra noise, spread over the interval
     extra = [float(v[rows] @ dt / dt.sum()) for v in (inertial.steps.extra_gyro, inertial.steps.extra_acc)]
-    parameters = base if base is not None and not any(extra) else _parameters(problem, *extra)
+    parameters = base if base is not None and not any(extra) else noise_of(problem, *extra)
     pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(x[15:18], x[18:21]))
     for acc, gyro, step in zip(inertial.acc[rows], inertial.gyro[rows], dt, strict=True):
         pim.integrateMeasurement(acc, gyro, step)
     return pim
 
 
-def _parameters(problem: Problem, extra_gyro: float, extra_acc: float) -> gtsam.PreintegrationCombinedParams:
+def noise_of(problem: Problem, extra_gyro: float = 0.0, extra_acc: float = 0.0) -> gtsam.PreintegrationCombinedParams:
+    """The IMU's noise and field for GTSAM, with the extra noise of steps that stand in for lost samples."""
     inertial = problem.inertial
     p = gtsam.PreintegrationCombinedParams(inertial.gravity_n)
     p.setGyroscopeCovariance(np.eye(3) * (inertial.white_gyro + extra_gyro))
@@ -110,12 +111,15 @@ def sensor_block(rows: Rows, states: States, free: np.ndarray, mu: float | None 
     """A sensor's rows linearised and weighted by their loss, and their squared normalised residuals (n,)."""
     r, Ji, Jj, Jc = rows.evaluate(states.x, states.c)
     nis = np.sum(r**2, axis=1)
-    root = np.sqrt(losses.weight(nis, rows.loss, rows.dof, mu))[:, None]
     A_c = np.zeros((len(r), r.shape[1], len(states.c)))
     A_c[:, :, rows.calib] = Jc
-    binary = Jj.shape[2] > 0
-    scaled = root[:, :, None]
-    return Block(rows.i, Ji * scaled, Jj * scaled if binary else None, A_c[:, :, free] * scaled, -r * root), nis
+    A_c = A_c[:, :, free]
+    if rows.loss != "none":
+        root = np.sqrt(losses.weight(nis, rows.loss, rows.dof, mu))[:, None]
+        r *= root
+        for J in (Ji, Jj, A_c):
+            J *= root[:, :, None]
+    return Block(rows.i, Ji, Jj if Jj.shape[2] else None, A_c, -r), nis
 
 
 def drift_block(problem: Problem, elapsed_s: Floats, states: States, m: int) -> Block:

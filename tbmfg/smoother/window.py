@@ -45,14 +45,14 @@ class _Window:
         self.imu = Block(
             np.zeros(0, dtype=int), *np.zeros((2, 0, 15, d)), np.zeros((0, 15, len(free))), np.zeros((0, 15))
         )
-        self.times, self.zero = problem.keyframes_s, graph.no_bias(2)
+        self.times, self.zero, self.noise = problem.keyframes_s, graph.no_bias(2), graph.noise_of(problem)
         self.out = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
         self.chain: Elimination | None = None  # as solved last
 
     def extend(self) -> None:
         """Add the next keyframe, where the IMU says that it is."""
         x, k = self.x[-1], self.first + len(self.x)
-        pim = graph.preintegrate(self.problem, k - 1, x)
+        pim = graph.preintegrate(self.problem, k - 1, x, self.noise)
         before = gtsam.NavState(gtsam.Rot3(x[:9].reshape(3, 3)), x[9:12], x[12:15])
         after = pim.predict(before, gtsam.imuBias.ConstantBias(x[15:18], x[18:21]))
         x = np.concatenate([after.attitude().matrix().ravel(), after.position(), after.velocity(), x[15:]])
@@ -100,13 +100,11 @@ class _Window:
     def leave(self, count: int, out: Online) -> None:
         """Let the oldest ``count`` keyframes leave, one at least stays; kept in ``out`` as they were solved last."""
         self._keep(count, out)
-        for _ in range(count):
-            self.left = marginal(self._blocks(1)[0], self.problem.size, len(self.free))
-            self.left_at = States(self.x[1:2].copy(), self.c.copy())
-            self.x, self.first = self.x[1:], self.first + 1
-            self.factors.pop(0)
-            self.imu_at, imu = self.imu_at[1:], self.imu
-            self.imu = Block(imu.i[:-1], imu.A_i[1:], imu.A_j[1:], imu.A_c[1:], imu.b[1:])
+        self.left = marginal(self._blocks(count)[0], count + 1, self.problem.size, len(self.free))
+        self.left_at = States(self.x[count : count + 1].copy(), self.c.copy())
+        self.x, self.first = self.x[count:], self.first + count
+        self.factors, self.imu_at, imu = self.factors[count:], self.imu_at[count:], self.imu
+        self.imu = Block(imu.i[:-count], imu.A_i[count:], imu.A_j[count:], imu.A_c[count:], imu.b[count:])
 
     def close(self, out: Online, solved: int) -> None:
         """Keep the first ``solved`` keyframes of the window, and the constants, as the last ones."""
