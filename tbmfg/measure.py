@@ -118,8 +118,9 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
     Intervals that the samples do not cover are left out.
     """
     starts, ends, period = periods(sensor, speeds)
-    steps = frame.steps
-    middle = 0.5 * (steps.edges_s[:-1] + steps.edges_s[1:])
+    edges_s = frame.steps.edges_s
+    edges_s = edges_s[: np.searchsorted(edges_s, keyframes_s[-1]) + 1]  # the keyframes may end long before the log
+    middle, dt = 0.5 * (edges_s[:-1] + edges_s[1:]), np.diff(edges_s)
     k = np.clip(np.searchsorted(ends, middle), 0, len(ends) - 1)
     covered = (middle > starts[k] - 0.01 * period) & (middle <= ends[k])
     v = np.where(covered, speeds.values[k], 0.0)
@@ -127,9 +128,9 @@ def odometer_rows(sensor: Odometer, speeds: Samples, keyframes_s: Floats, frame:
 
     E = rotation_from_rpy(np.array([0.0, sensor.pitch, sensor.yaw]))
     ahead = frame.at(middle) @ E[:, 0]
-    way, smoothed = (ahead * (speed * steps.dt)[:, None] for speed in (v, smooth))
-    sums = [_cumulative(values) for values in (way, smoothed, way * middle[:, None], covered * steps.dt)]
-    way, smoothed, sweep, cover = (np.diff(_interpolate(steps.edges_s, values, keyframes_s), axis=0) for values in sums)
+    way, smoothed = (ahead * (speed * dt)[:, None] for speed in (v, smooth))
+    sums = [_cumulative(values) for values in (way, smoothed, way * middle[:, None], covered * dt)]
+    way, smoothed, sweep, cover = (np.diff(_interpolate(edges_s, values, keyframes_s), axis=0) for values in sums)
 
     length = np.diff(keyframes_s)
     i = np.flatnonzero(cover > 0.999 * length - 1e-9)

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import shutil
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
@@ -162,22 +163,48 @@ def test_several_estimators_have_a_folder_each(logs, tmp_path):
     assert len(list(csv.DictReader((tmp_path / "out" / "batch.csv").open()))) == 2
 
 
-def test_logs_and_results_at_urls(logs, tmp_path):
+@pytest.fixture(params=["memory", "s3"])
+def store(request, monkeypatch) -> Iterator[str]:
+    """A store's kind, with the buckets "fleet" and "results": in memory, or an S3 server on this machine."""
+    if request.param == "memory":
+        yield "memory"
+        return
+    moto = pytest.importorskip("moto.server", reason="moto is not installed: no S3-compatible server to ask")
+    s3fs = pytest.importorskip("s3fs", reason="s3fs is not installed: s3:// cannot be opened")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "nobody")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "nothing")
+    s3fs.S3FileSystem.clear_instance_cache()
+    for bucket in ("fleet", "results"):
+        s3fs.S3FileSystem().mkdir(bucket)
+    yield "s3"
+    s3fs.S3FileSystem.clear_instance_cache()
+    server.stop()
+
+
+def test_logs_and_results_at_urls(store, logs, tmp_path):
     for shift in ("day", "night"):
-        at = storage.place(f"memory://fleet/{shift}/run.mcap")
+        at = storage.place(f"{store}://fleet/{shift}/run.mcap")
         at.parent.mkdir(parents=True, exist_ok=True)
         at.write_bytes((logs / shift / "run.mcap").read_bytes())
 
     def again(*arguments) -> dict:
-        return batch.run(arguments, output="memory://results", estimators=["ins"], on=here())
+        return batch.run(arguments, output=f"{store}://results", estimators=["ins"], on=here())
 
-    assert statuses(again("memory://fleet")) == {"day-run": "done", "night-run": "done"}
-    assert statuses(again("memory://fleet/*/run.mcap")) == {"day-run": "kept", "night-run": "kept"}
+    assert statuses(again(f"{store}://fleet")) == {"day-run": "done", "night-run": "done"}
+    assert statuses(again(f"{store}://fleet/*/run.mcap")) == {"day-run": "kept", "night-run": "kept"}
     batch.run([logs], output=(logs.parent / "local").as_uri(), estimators=["ins"], on=here())
-    remote = storage.place("memory://results/day-run")
+    remote = storage.place(f"{store}://results/day-run")
     assert {file.name for file in remote.iterdir()} >= {"result.mcap", "result.npz", "summary.json", "job.json"}
     assert (remote / "trajectory.tum").read_bytes() == (logs.parent / "local/day-run/trajectory.tum").read_bytes()
-    assert json.loads(storage.place("memory://results/batch.json").read_text())["kept"] == 2
+    assert json.loads(storage.place(f"{store}://results/batch.json").read_text())["kept"] == 2
+    storage.place(f"{store}://fleet/day/run.mcap").write_bytes((logs / "night" / "run.mcap").read_bytes())
+    report = again(f"{store}://fleet")
+    assert statuses(report) == {"day-run": "failed", "night-run": "kept"}
+    assert "holds results of other inputs (log)" in report["logs"][0]["reason"]
 
 
 def test_a_url_of_no_known_kind_is_said(tmp_path):

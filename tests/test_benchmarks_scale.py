@@ -33,8 +33,9 @@ def test_an_hour_is_held_to_what_is_asked_of_it():
 
 
 def test_updates_that_slow_down_are_seen():
-    [*_, last] = scale.update_rows("fixed-lag", {"ms": [1.0] * 60 + [1.5] * 60, "length": 600.0})
-    assert (last.metric, last.mean, last.inside) == ("late / early", 1.5, False)
+    mean, *_, last = scale.update_rows("fixed-lag", {"ms": [2.0] * 60 + [3.0] * 60, "length": 600.0})
+    assert (mean.metric, mean.mean, mean.inside) == ("update, mean", 2.5, True)
+    assert (last.metric, last.mean, last.inside) == ("update, late / early", 1.5, False)
 
 
 def test_lengths_that_are_none_are_refused():

@@ -144,7 +144,8 @@ def _windows(t_s, position_n, window_s, max_windows, end_s, offsets_s):
     found = []
     margin = float(np.max(np.abs(offsets_s)))
     for start in np.arange(margin, end_s - window_s - margin, window_s / 2):
-        rows = np.flatnonzero((t_s >= start + margin) & (t_s <= start + window_s - margin))
+        first = np.searchsorted(t_s, start + margin)
+        rows = np.arange(first, np.searchsorted(t_s, start + window_s - margin, side="right"))
         if len(rows) < 12:
             continue
         t = t_s[rows] - t_s[rows].mean()

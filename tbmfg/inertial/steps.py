@@ -80,14 +80,17 @@ def make_steps(imu: Series, R_bi: Floats, stamp: str) -> Steps:
     filled = np.concatenate(fill_t)
     order = np.argsort(np.concatenate([ends, filled]), kind="stable")
     all_ends = np.concatenate([ends, filled])[order]
-    is_fill = order >= len(ends)
     columns = [np.stack([np.interp(all_ends, ends, v[:, a]) for a in range(3)], axis=1) for v in (gyro, acc)]
     extra = [np.zeros(len(all_ends)), np.zeros(len(all_ends))]
-    for start, end in gaps:
-        rows = is_fill & (all_ends > start) & (all_ends <= end + 1e-9)
-        for noise, known in zip(extra, (gyro, acc), strict=True):
+    for noise, known in zip(extra, (gyro, acc), strict=True):
+        errors: dict[int, float] = {}  # by the number of samples lost
+        for start, end in gaps:
+            rows = slice(*np.searchsorted(all_ends, [start, end + 1e-9], side="right"))
+            count = int(rows.stop - rows.start)
+            if count not in errors:
+                errors[count] = interpolation_error(known, count)
             # the error is taken as one constant over the gap: variance x length is its equivalent white density
-            noise[rows] = interpolation_error(known, int(rows.sum())) ** 2 * (end - start)
+            noise[rows] = errors[count] ** 2 * (end - start)
     edges = np.concatenate([[all_ends[0] - period], all_ends])
     return Steps(t0_ns, edges, columns[0], columns[1], extra[0], extra[1], period, tuple(gaps))
 

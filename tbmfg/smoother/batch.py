@@ -76,9 +76,7 @@ class _Descent:
         damping = 0.0
         for _ in range(most):
             self.iterations += 1
-            chain = eliminate(self.blocks + _damping(self.blocks, damping, n, d, m), n, d, m)
-            _check(problem, chain)
-            dx, dc = chain.solve()
+            dx, dc = _step(problem, self.blocks + _damping(self.blocks, damping, n, d, m), m)
             for correct, part in TRIES:
                 c = self.states.c.copy()
                 c[free] += part * dc
@@ -142,6 +140,14 @@ def _linearise(
         blocks.append(block)
         cost += losses.cost(nis[rows.sensor], rows.loss, rows.dof, mu)
     return blocks, nis, cost
+
+
+def _step(problem: Problem, blocks: list[Block], m: int) -> tuple[Floats, Floats]:
+    """Least squares step of states and free constants. The elimination is gone with its end: it is as large as all
+    rows, which the next linearisation holds twice."""
+    chain = eliminate(blocks, len(problem.keyframe_edges), problem.size, m)
+    _check(problem, chain)
+    return chain.solve()
 
 
 def _damping(blocks: list[Block], damping: float, n: int, d: int, m: int) -> list[Block]:

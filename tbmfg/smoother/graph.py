@@ -98,12 +98,14 @@ def imu_block(graph: gtsam.NonlinearFactorGraph, x: Floats, zero: gtsam.Values, 
     for k in range(n):
         factor = linear.at(k)
         A[k], b[k] = factor.getA(), factor.getb()
-    A = A[:, :, COLUMNS]
+    del linear  # some kilobytes a factor
     R = x[:, :9].reshape(-1, 3, 3)
     sides = []
-    for side, rotation in ((A[:, :, :15], R[:-1]), (A[:, :, 15:], R[1:])):
+    for columns, rotation in ((COLUMNS[:NAV], R[:-1]), (COLUMNS[NAV:], R[1:])):
+        side = np.zeros((n, NAV, NAV + e))
+        side[:, :, :NAV] = A[:, :, columns]
         side[:, :, POS] = side[:, :, POS] @ rotation.transpose(0, 2, 1)
-        sides.append(np.concatenate([side, np.zeros((n, 15, e))], axis=2))
+        sides.append(side)
     return Block(np.arange(n), sides[0], sides[1], np.zeros((n, 15, m)), b)
 
 

@@ -58,7 +58,7 @@ def run(problem: Problem, progress: Callable[[float], None] | None = None) -> On
             isam.update(step.graph, step.values)
             _record(isam, factors, k, out, e)
             out.reanchored.append((k, _reason(error)))
-        if progress is not None and k % 50 == 0:
+        if progress is not None:
             progress(k / n)
     _settle(isam)
     values = isam.calculateEstimate()

@@ -177,7 +177,7 @@ def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None
             window.solve()
             out.reanchored.append((k, str(error)))
         out.causal_x[k], out.causal_cov[k] = window.x[-1], window.chain.covariances(k - window.first)[0][0]
-        if progress is not None and k % 50 == 0:
+        if progress is not None:
             progress(k / len(times))
     window.close(out, len(window.x))
     return out
