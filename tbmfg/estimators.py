@@ -193,6 +193,39 @@ def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
     return out
 
 
+def tbm_mse(problem: Problem, progress: Progress, name: str) -> Result:
+    """TBM-MSE of Liu, Wang & Tao, its ablation, or LINS as they compare with."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from tbmfg.filters import mse
+    from tbmfg.inertial.steps import to_ns
+    from tbmfg.outcome import result
+    from tbmfg.state import Innovations
+
+    design = mse.DESIGNS[name]
+    run = mse.run(problem, design, switches(problem.rig, name, design.switches), progress)
+    f, scans = run.filtered, run.scans
+    edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
+    out = result(run.seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
+    unheld, nis = np.array(scans.unheld, dtype=bool), np.array(scans.nis)
+    out.innovations[scans.name] = Innovations(edges_ns[np.array(scans.edges, dtype=int)], nis, 6, unheld)
+    count = replace(out.counts[scans.name], used=scans.begun + int((~unheld).sum()), gated=int(unheld.sum()), unused=0)
+    out.counts[scans.name] = replace(count, unused=count.received - count.parts())
+    out.warnings += run.warnings
+    return out
+
+
+def _tbm_mse(name: str, summary: str, *needs: str) -> Estimator:
+    def load() -> type[Node]:
+        from tbmfg.filters.mse import DESIGNS
+
+        return DESIGNS[name].switches
+
+    return Estimator(partial(tbm_mse, name=name), summary, ("imu", *needs), "Liu, Wang & Tao (TBM-MSE)", load)
+
+
 def _tbm_switches() -> type[Node]:
     from tbmfg.filters.tbm import InsTs
 
@@ -251,6 +284,16 @@ OWN: dict[str, Estimator] = {
         "Liu, Wang & Tao (TBM-MSE)",
         _tbm_switches,
     ),
+    "tbm-mse": _tbm_mse(
+        "tbm-mse",
+        "tbm-ins-ts with inertial enhancement, and scans laid on a local map of edges and planes",
+        "prism",
+        "lidar",
+    ),
+    "tbm-mse-star": _tbm_mse(
+        "tbm-mse-star", "tbm-mse without inertial enhancement, coning and sculling", "prism", "lidar"
+    ),
+    "tbm-lins": _tbm_mse("tbm-lins", "tbm-mse-star without the total station", "lidar"),
     "tbm-rrr-mf": Estimator(
         tbm_rrr_mf,
         "the states of tbm-ins-ts and LiDAR odometry of a fixed covariance in a factor graph",
@@ -290,7 +333,7 @@ def estimate(name: str, problem: Problem, *, progress: Callable[[str, float], No
 
 def unmet(name: str, problem: Problem) -> str | None:
     """What an estimator needs and this problem does not have, or None."""
-    have = {"imu", *map(kind_of, problem.samples)}
+    have = {"imu", *map(kind_of, problem.samples), *map(kind_of, problem.scans)}
     missing = [kind for kind in ESTIMATORS[name].needs if kind not in have]
     return f"needs {', '.join(missing)}" if missing else None
 

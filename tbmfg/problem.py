@@ -10,6 +10,7 @@ import numpy as np
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.steps import Steps, to_ns
+from tbmfg.lidar.clouds import Scans
 from tbmfg.measure import Samples
 from tbmfg.rig import Rig
 from tbmfg.sensors import Rows
@@ -93,7 +94,8 @@ class Problem:
     ``keyframe_edges`` (n,) are the IMU edges at which the keyframes lie.
     ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
     ``clock_offset_s`` the offsets that the rows were placed with; ``samples`` what the rows were made of, by sensor,
-    for filters that take every sample when it comes.
+    for filters that take every sample when it comes. ``scans`` are those of every LiDAR, still in the log; ``measured``
+    the IMU's steps before any enhancement.
     """
 
     rig: Rig
@@ -111,6 +113,8 @@ class Problem:
     calibration: dict[str, Calibrated] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    scans: dict[str, Scans] = field(default_factory=dict)
+    measured: Steps | None = None
 
     @property
     def t0_ns(self) -> int:

@@ -23,6 +23,7 @@ from scipy.stats import chi2
 
 from tbmfg.fields import Node, Positive
 from tbmfg.filters.kalman import correct, innovation, predict
+from tbmfg.filters.scanmap import CLONE, ScanMap
 from tbmfg.inertial.strapdown import BA_, BG_, correct_state, propagate
 from tbmfg.measure import gyro_frame, position_rows
 from tbmfg.problem import GATE, Parameters, Problem
@@ -31,6 +32,7 @@ from tbmfg.sensors import Rows
 from tbmfg.state import BA, BG, NAV
 from tbmfg.timeseries import Floats
 
+REOPEN = 10  # fixes gated in a row after which the map that contradicts them is given up
 LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
 
 
@@ -60,13 +62,13 @@ class Filtered:
     gated: dict[str, np.ndarray]
 
 
-def view(problem: Problem, switches: InsTs) -> Problem:
-    """The problem as the filter sees it: the prism's fixes one by one, as rows at IMU edges."""
-    samples = {name: s for name, s in problem.samples.items() if kind_of(name) == "prism"}
+def view(problem: Problem, switches: InsTs, kinds: tuple[str, ...] = ("prism",)) -> Problem:
+    """The problem as the filter sees it: the fixes of sensors of these kinds one by one, as rows at IMU edges."""
+    samples = {name: s for name, s in problem.samples.items() if kind_of(name) in kinds}
     known, inertial, rig = problem.parameters, problem.inertial, problem.rig
     own = [k for k, name in enumerate(known.names) if name.rpartition(".")[0] in samples]
     names, mean, start, sd = tuple(known.names[k] for k in own), known.mean[own], known.start[own], known.sd[own]
-    arms = np.array([".arm_" in name for name in names])
+    arms = np.array([".arm_" in name for name in names], dtype=bool)
     if switches.arm == "none":
         mean, start = np.where(arms, 0.0, mean), np.where(arms, 0.0, start)
     sd = np.where(arms & (switches.arm == "estimated"), sd, 0.0)  # clock offsets are those that prepare has found
@@ -82,16 +84,24 @@ def view(problem: Problem, switches: InsTs) -> Problem:
     return replace(problem, rows=rows, samples=samples, parameters=parameters, drift_names=(), drift_walk=np.zeros(0))
 
 
-def run(problem: Problem, switches: InsTs, progress: Callable[[float], None] | None = None) -> Filtered:
-    """Filter a problem as :func:`view` gives it."""
+def run(
+    problem: Problem,
+    switches: InsTs,
+    progress: Callable[[float], None] | None = None,
+    scans: ScanMap | None = None,
+) -> Filtered:
+    """Filter a problem as :func:`view` gives it, and with it ``scans``, which keep their own counts."""
     parameters, free, keyframes = problem.parameters, problem.parameters.free, problem.keyframe_edges
     x, c = problem.prior.x[:21].copy(), parameters.start.copy()
-    P = np.diag(np.concatenate([np.zeros(NAV), parameters.sd[free] ** 2]))
+    own = NAV + len(free)
+    P = np.zeros((own + CLONE * (scans is not None),) * 2)
     P[:NAV, :NAV] = problem.prior.filter_cov[:NAV, :NAV]
+    P[NAV:own, NAV:own] = np.diag(parameters.sd[free] ** 2)
     predicted = Prediction(problem, switches.tau_s)
     nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
-    epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows]))
+    in_a_row = dict.fromkeys(nis, 0)
+    epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows] or [keyframes]))
     due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
     for rows in problem.rows:
         for r, number in enumerate(np.searchsorted(epochs, rows.i)):
@@ -99,23 +109,39 @@ def run(problem: Problem, switches: InsTs, progress: Callable[[float], None] | N
 
     xs, covs, last = [], [], keyframes[0]
     for number, epoch in enumerate(epochs):
+        for scan in scans.until(epoch) if scans is not None else ():
+            x, P = predicted(x, P, last, scan.last)
+            last = scan.last
+            dx, P = scans.update(scan, x, P)
+            x = correct_state(x, dx[:NAV])
+            c[free] += dx[NAV:own]
+            scans.passing(last, x)
         x, P = predicted(x, P, last, epoch)
         last = epoch
         for rows, r in due[number]:
-            residual, H = linearise(rows, r, x, c, free)
+            residual, H = linearise(rows, r, x, c, free, len(P))
             nis[rows.sensor][r] = innovation(P, H, residual)[0]
-            gated[rows.sensor][r] = nis[rows.sensor][r] > chi2.ppf(GATE, rows.dof)
-            if not gated[rows.sensor][r]:
-                dx, P = correct(P, H, residual)  # (23)-(25)
-                x = correct_state(x, dx[:NAV])  # (26)
-                c[free] += dx[NAV:]
+            in_a_row[rows.sensor] += 1
+            if nis[rows.sensor][r] > chi2.ppf(GATE, rows.dof):
+                if scans is None or in_a_row[rows.sensor] <= REOPEN:
+                    gated[rows.sensor][r] = True
+                    continue
+                P = scans.forsaken(P, residual * rows.sigma[r])
+            in_a_row[rows.sensor] = 0
+            dx, P = correct(P, H, residual)  # (23)-(25)
+            x = correct_state(x, dx[:NAV])  # (26)
+            c[free] += dx[NAV:own]
+            if scans is not None:
+                scans.shifted(dx)
+        if scans is not None:
+            scans.passing(epoch, x)
         if epoch == keyframes[len(xs)]:
             xs.append(x)
             covs.append(P[:NAV, :NAV])
         if progress is not None and number % 1000 == 0:
             progress(number / len(epochs))
     c_cov = np.zeros((len(c), len(c)))
-    c_cov[np.ix_(free, free)] = P[NAV:, NAV:]
+    c_cov[np.ix_(free, free)] = P[NAV:own, NAV:own]
     return Filtered(np.array(xs), np.array(covs), c, c_cov, nis, gated)
 
 
@@ -146,10 +172,11 @@ class Prediction:
         return x, P
 
 
-def linearise(rows: Rows, r: int, x: Floats, c: Floats, free: np.ndarray) -> tuple[Floats, Floats]:
-    """Whitened residual of one row and its Jacobian to [state, free calibrations]."""
+def linearise(rows: Rows, r: int, x: Floats, c: Floats, free: np.ndarray, size: int) -> tuple[Floats, Floats]:
+    """Whitened residual of one row and its Jacobian to [state, free calibrations, nothing], (., size)."""
     one = x[None]
     residual, Ji, _, Jc = (part[0] for part in rows.evaluate_at(one, one, c, slice(r, r + 1)))
     calibrations = np.zeros((len(residual), len(c)))
     calibrations[:, rows.calib] = Jc
-    return residual, np.hstack([Ji, calibrations[:, free]])
+    H = np.hstack([Ji, calibrations[:, free]])
+    return residual, np.pad(H, ((0, 0), (0, size - H.shape[1])))

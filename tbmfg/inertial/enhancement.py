@@ -18,8 +18,10 @@ import numpy as np
 from numba import njit
 from scipy.signal import fftconvolve
 
+from tbmfg.fields import DEG, MICRO_G
 from tbmfg.inertial.steps import Steps
 from tbmfg.inertial.strapdown import exp_rotation
+from tbmfg.rig import Enhancement
 from tbmfg.timeseries import Floats
 
 Rule = Literal["noise", "kept"]
@@ -31,11 +33,36 @@ SHORTEST = 16  # samples of a window that can be decomposed
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """What an enhancement did to the gyro [rad/s] and the accelerometer [m/s^2]: ``rms`` of the change per axis, and
+    """What the decomposition did to the gyro [rad/s] and the accelerometer [m/s^2]: ``rms`` of the change per axis, and
     the white ``density`` [unit/sqrt(Hz)] that it leaves in the filters' model."""
 
     rms: tuple[float, float]
     density: tuple[float, float]
+    window_s: float
+
+    def __str__(self) -> str:
+        (gyro, acc), (gyro_density, acc_density) = self.rms, self.density
+        return (
+            f"imu: enhanced by mode decomposition in windows of {self.window_s:g} s, so that an online estimate lags "
+            f"by as much: {acc:.3g} m/s^2 and {gyro / DEG:.3g} deg/s rms taken away; what may have been motion of it "
+            f"counts as noise of {acc_density / MICRO_G:.3g} ug and {gyro_density / DEG:.2g} deg/s per sqrt(Hz)"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Levelled:
+    """What holding the tilt put into the gyro's rates [rad/s]: ``rms`` per axis, and the white ``density``."""
+
+    rms: float
+    density: float
+    alpha_bar: float
+
+    def __str__(self) -> str:
+        return (
+            f"imu: tilt held by gravity with alpha_bar {self.alpha_bar:g}: {self.rms / DEG:.2g} deg/s rms put into the "
+            f"gyro's rates, counted as noise of {self.density / DEG:.2g} deg/s per sqrt(Hz); accelerating is taken for "
+            "tilt"
+        )
 
 
 def denoise(steps: Steps, rule: Rule, window_s: float, give_back: bool = True) -> tuple[Steps, Changed]:
@@ -48,7 +75,7 @@ def denoise(steps: Steps, rule: Rule, window_s: float, give_back: bool = True) -
         steps, gyro=gyro, acc=acc,
         extra_gyro=steps.extra_gyro + density[0] ** 2, extra_acc=steps.extra_acc + density[1] ** 2,
     )  # fmt: skip
-    return found, Changed(tuple(float(np.sqrt(np.mean(part**2))) for part in parts), density)
+    return found, Changed(tuple(float(np.sqrt(np.mean(part**2))) for part in parts), density, window_s)
 
 
 def enhanced(x: Floats, rule: Rule, size: int, give_back: bool) -> Floats:
@@ -126,6 +153,17 @@ def changed_density(change: Floats, period_s: float, size: int) -> float:
 
 
 # ---- tilt ----
+
+
+def level(
+    steps: Steps, gyro: Floats, acc: Floats, R_start: Floats, bias_gyro: Floats, earth_n: Floats, g: float,
+    wanted: Enhancement,
+) -> tuple[Steps, Floats, Levelled]:  # fmt: skip
+    """Steps with the noise that :func:`gravity_correction` leaves in the filters' model, ``gyro`` with its rates."""
+    rates = gravity_correction(steps, gyro, acc, R_start, bias_gyro, earth_n, g, wanted.alpha_bar)
+    density = changed_density(rates, steps.period_s, max(1, round(wanted.window / steps.period_s)))
+    told = Levelled(float(np.sqrt(np.mean(rates**2))), density, wanted.alpha_bar)
+    return replace(steps, extra_gyro=steps.extra_gyro + density**2), gyro + rates, told
 
 
 def gravity_correction(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,29 @@ class Scan:
     zero: int
     beyond: int
     fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Scans:
+    """The scans of one LiDAR that are to be used, read from the log one by one in every iteration.
+
+    ``start_s`` (n,) are the true times of all header stamps, ``wanted`` (n,) which of them to read, ``period_s`` the
+    usual time between them. Yields the time of the stamp and the scan; raises LogError as :func:`read`.
+    """
+
+    sensor: Lidar
+    source: Iterable[tuple[int, dict[str, NDArray]]] = field(repr=False)
+    start_s: Floats
+    wanted: NDArray
+    period_s: float
+
+    def __len__(self) -> int:
+        return int(self.wanted.sum())
+
+    def __iter__(self) -> Iterator[tuple[float, Scan]]:
+        for k, (t_ns, fields) in enumerate(self.source):
+            if self.wanted[k]:
+                yield float(self.start_s[k]), read(t_ns, fields, self.sensor, self.period_s)
 
 
 def read(t_ns: int, fields: dict[str, NDArray], sensor: Lidar, period_s: float) -> Scan:

@@ -202,9 +202,9 @@ def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Bl
         yield odometry.register(scan, start_s)
 
 
-def whitening(information: Floats, noise_factor: float) -> Floats:
-    """Square root S of an information matrix, S' S, with sds no smaller than the least ones; (6, 6)."""
-    scale = np.repeat(NEAREST_SD, 3)
+def whitening(information: Floats, noise_factor: float, least_sd: tuple[float, float] = NEAREST_SD) -> Floats:
+    """Square root S of an information matrix, S' S, with sds no smaller than the least ones, rad and m; (6, 6)."""
+    scale = np.repeat(least_sd, 3)
     value, vector = np.linalg.eigh(information * np.outer(scale, scale))
     value = np.where(value > 1e-12 * max(value[-1], 1.0), value, 0.0)  # what rounding leaves of a weak direction
     return (np.sqrt(value / (1.0 + value)) / noise_factor)[:, None] * vector.T / scale

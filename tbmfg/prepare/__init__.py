@@ -42,8 +42,8 @@ def prepare(
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
     log, rig, said = gnss.into_n(log, rig)
     warnings: list[str] = [*log.damage, *losses(log, rig, without), *said]
-    steps, imu_counts = imu_steps(log, rig, outages, warnings)
-    steps = enhance.denoised(rig, steps, warnings)
+    measured, imu_counts = imu_steps(log, rig, outages, warnings)
+    steps = enhance.denoised(rig, measured, warnings)
     missing: list[str] = []
     samples, counts = usable_samples(log, rig, steps, outages, without, missing)
     lidars = scans.present(log, rig, without)
@@ -61,6 +61,7 @@ def prepare(
         offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
         problem = search.find(setup, offsets, tell)
         problem.calibration |= told | delays | setup.calibration
+        problem.measured, problem.scans = measured, setup.scans
     problem.intervals = [
         *setup.intervals,
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),

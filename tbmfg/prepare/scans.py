@@ -36,32 +36,30 @@ def register(
     log: Log, name: str, setup: Setup, outages: tuple[tuple[str, float, float], ...], tell: Callable[[float], None]
 ) -> None:
     """Register the scans of the LiDAR ``name`` on a map, and put its poses (n, 48) among the samples of ``setup``: R,
-    p, and the square root of the information of the step from the pose before. Scans are read one by one; what they
-    lacked, where they did not fit, and whether they turn as the gyro does is put beside."""
+    p, and the square root of the information of the step from the pose before. Scans are read one by one, and can be
+    read again from ``setup.scans``; what they lacked, where they did not fit, and whether they turn as the gyro does is
+    put beside."""
     sensor: Lidar = setup.rig.sensors[name]
     source, steps = log.clouds[sensor.topic], setup.steps
     stamps_s = seconds(source.t_ns, steps.t0_ns) - sensor.clock_offset
     out = hidden(name, stamps_s + sensor.clock_offset, outages)
     inside = (stamps_s >= steps.edges_s[0]) & (stamps_s <= steps.end_s)
     period_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.1
+    setup.scans[name] = scans = clouds.Scans(sensor, source, stamps_s, inside & ~out, period_s)
     odometry = Odometry(sensor, Inertia(steps.edges_s, setup.frame.R_0t, _way(setup), sensor.T_bl.R, sensor.T_bl.xyz))
     points, faults, few, poses = Counter(), Counter(), 0, []
-    for k, (t_ns, fields) in enumerate(source):
+    for k, (start_s, scan) in enumerate(scans):
         if k % 50 == 0:
-            tell(k / len(source))
-        if not inside[k] or out[k]:
-            continue
-        scan = clouds.read(t_ns, fields, sensor, period_s)
+            tell(k / len(scans))
         points.update(taken=len(scan.points), nonfinite=scan.nonfinite, zero=scan.zero, beyond=scan.beyond)
         faults.update([scan.fault] if scan.fault else [])
-        pose = odometry.register(scan, stamps_s[k])
+        pose = odometry.register(scan, start_s)
         few += pose is None
         poses += [pose] if pose is not None and pose.t_s <= steps.end_s else []
     setup.counts[name].outage = int(out.sum())
-    asked = int((inside & ~out).sum())
     for what, number in (("hold too few points, or repeat a time", few), *faults.items()):
-        if number > WORTH_SAYING * asked:
-            setup.warnings.append(f"{name}: {number} of {asked} scans: {what}")
+        if number > WORTH_SAYING * len(scans):
+            setup.warnings.append(f"{name}: {number} of {len(scans)} scans: {what}")
     setup.warnings += [f"{name}: {line}" for line in (*_of_points(points, sensor), *_of_poses(poses, odometry))]
     setup.intervals += [
         Interval(name, "lost", *(int(t) for t in to_ns(steps, np.array(ends)))) for ends in _astray(poses)

@@ -10,6 +10,7 @@ from tbmfg import earth
 from tbmfg.geometry import rotation_from_rpy, rotation_z, wrap, yaw_of
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps, compensate
+from tbmfg.lidar.clouds import Scans
 from tbmfg.measure import GyroFrame, Samples, gyro_frame
 from tbmfg.prepare import rest
 from tbmfg.prepare.rest import Rest
@@ -46,6 +47,7 @@ class Setup:
     warnings: list[str] = field(default_factory=list)
     calibration: dict[str, Calibrated] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
+    scans: dict[str, Scans] = field(default_factory=dict)
 
 
 def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> Setup:
