@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import datasets
 from benchmarks.__main__ import main
-from benchmarks.papers import Plan, sbm, shearer, tbm
+from benchmarks.papers import Plan, sbm, shearer, tbm, tbm_drives
 from benchmarks.papers.trials import Method, Outcome, Outcomes, Trial, confidence, run
 from benchmarks.rows import read_rows
 from benchmarks.runs import true_states
@@ -238,12 +238,56 @@ def test_the_pump_turns_the_heading_of_a_mean_and_not_of_a_rotation():
 
 def test_the_roadheaders_drives_are_measured():
     """On a drive without its LiDAR, which takes longer than all else."""
-    methods = tuple(method for method in tbm.METHODS if method.estimator in ("tbm-ins-ts", "ins"))
-    trial = Trial("dust", "tbm-drive", 0, 12.0, methods, tbm.errors, options={"imu_rate_hz": 100.0})
+    methods = tuple(method for method in tbm_drives.METHODS if method.estimator in ("tbm-ins-ts", "ins"))
+    trial = Trial("dust", "tbm-drive", 0, 12.0, methods, tbm_drives.errors, options={"imu_rate_hz": 100.0})
     rows = {row.key: row for row in Outcomes(run(trial)).rows("dust", {}, {})}
     assert rows["dust", "tbm-ins-ts", "failed"].mean == 0
     assert 0 < rows["dust", "tbm-ins-ts", "position_rms"].mean < 0.1
     assert rows["dust", "ins", "over 0.3 m"].mean == 0
+
+
+def outcome(scenario, method, metric, value):
+    return Outcome(scenario, method, 0, {metric: (value, "m")})
+
+
+def test_the_published_ordering_is_looked_for_log_by_log():
+    names = (tbm_drives.MSE, tbm_drives.RRR, tbm_drives.LINS)
+
+    def seen(scenario, metric, *values):
+        found = Outcomes([outcome(scenario, name, metric, v) for name, v in zip(names, values, strict=True)])
+        return tbm_drives.ordering(found, scenario).mean
+
+    assert seen("clean", "z_max", 0.015, 0.018, 0.1) == 100
+    assert seen("clean", "z_max", 0.015, 0.05, 0.1) == 0  # not alike
+    assert seen("clean", "z_max", 0.015, 0.018, 0.01) == 0
+    assert seen("dust 0.2", "position_max", 0.1, 5.0, 2.0) == 100
+    assert seen("dust 0.2", "position_max", 0.4, 5.0, 2.0) == 0
+    assert seen("dust 0.2", "position_max", 0.1, 5.0, 0.2) == 0
+    levels = Outcomes(
+        [
+            outcome(tbm_drives.dusty(k), "ins", "position_max", v)
+            for k, v in zip(tbm_drives.DUST, (0.1, 0.4, 9), strict=True)
+        ]
+    )
+    assert tbm_drives.level(levels, "ins").mean == 0.2
+    assert tbm_drives.level(levels, "batch").mean is None
+
+
+def test_lins_is_measured_against_the_other_filter_as_in_the_tables():
+    t_ns = np.arange(40) * 100_000_000
+    straight = np.column_stack([0.01 * np.arange(40), np.zeros((40, 2))])
+
+    def result(name, position):
+        quat = np.tile([0.0, 0.0, 0.0, 1.0], (40, 1))
+        return Result(name, Trajectory(t_ns, position, quat, *np.zeros((3, 40, 3)), np.zeros((40, 15, 15))))
+
+    results = {name: result(name, straight * share) for name, share in ((tbm_drives.MSE, 1.0), (tbm_drives.LINS, 2.0))}
+    found = tbm_drives.between(results)[tbm_drives.LINS]
+    assert found["ape to tbm-mse, max"][0] == pytest.approx(0.39)
+    assert found["ape to tbm-mse, min"][0] == 0
+    assert found["rpe to tbm-mse, mean"][0] == pytest.approx(0.1)
+    assert found["rpe to tbm-mse, sd"][0] == pytest.approx(0, abs=1e-12)
+    assert tbm_drives.between({tbm_drives.LINS: results[tbm_drives.LINS]}) == {}
 
 
 def test_wrong_papers_and_numbers_are_refused(capsys):

@@ -41,7 +41,8 @@ class Trial:
     """One log to simulate, ``settings`` and ``options`` as :func:`datasets.make` takes them, and who estimates it.
 
     ``metrics`` measures a result against the truth at its keyframes; ``rig`` says with the seed what the estimators are
-    told, where that is not just the log's own rig. Both are functions of a module, so that another process finds them.
+    told, where that is not just the log's own rig; ``between`` measures the results against each other, by label. All
+    are functions of a module, so that another process finds them.
     """
 
     scenario: str
@@ -53,6 +54,7 @@ class Trial:
     settings: tuple[str, ...] = ()
     options: dict[str, Any] = field(default_factory=dict)
     rig: Callable[[Simulation, int], Rig] | None = None
+    between: Callable[[dict[str, Result]], dict[str, Metrics]] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,7 @@ def run(trial: Trial) -> list[Outcome]:
         trial.dataset, seed=trial.seed, duration=duration_s, settings=trial.settings, **trial.options
     )
     rig = simulation.rig if trial.rig is None else trial.rig(simulation, trial.seed)
-    outcomes, problem = [], None
+    outcomes, results, problem = [], {}, None
     for method in trial.methods:
         if trial.seed % method.every:
             continue
@@ -88,9 +90,11 @@ def run(trial: Trial) -> list[Outcome]:
             problem = problem or prepare(in_memory(simulation), rig)
             result = estimate(method.estimator, replace(problem, rig=override(rig, method.settings)))
             outcomes.append(_measured(trial, method.label, simulation, result, duration_s))
+            results[method.label] = result
         except TbmfgError as error:
             outcomes.append(Outcome(trial.scenario, method.label, trial.seed, {}, failure=str(error)))
-    return outcomes
+    between = trial.between(results) if trial.between is not None else {}
+    return [replace(one, metrics=one.metrics | between.get(one.method, {})) for one in outcomes]
 
 
 def _measured(trial: Trial, label: str, simulation: Simulation, result: Result, duration_s: float) -> Outcome:

@@ -102,14 +102,15 @@ def _patches(points, voxel, keys, moments, printed):
         found = _neighbours(points[row], voxel, keys, moments, nearest, place)
         if found < NEIGHBOURS:
             continue
-        centre = np.zeros(3)
+        centre, S = np.zeros(3), np.zeros((3, 3))
         for k in range(NEIGHBOURS):
-            centre += place[k] / NEIGHBOURS
+            for a in range(3):
+                centre[a] += place[k, a] / NEIGHBOURS
         about = points[row] if printed else centre  # E19
-        S = np.zeros((3, 3))
         for k in range(NEIGHBOURS):
-            y = place[k] - about
-            S += y.reshape(3, 1) * y / NEIGHBOURS
+            for a in range(3):
+                for b in range(3):
+                    S[a, b] += (place[k, a] - about[a]) * (place[k, b] - about[b]) / NEIGHBOURS
         value, vector = np.linalg.eigh(S)
         mean[row], variance[row] = centre, value[::-1]
         axes[row] = vector.T[::-1]
@@ -140,13 +141,16 @@ def _neighbours(point, voxel, keys, moments, nearest, place):
                 row = find(key, keys)
                 if keys[row] == EMPTY or moments[row, 0] < LEAST:
                     continue
-                x, y, z = moments[row, 1:4] / moments[row, 0]
+                share = 1.0 / moments[row, 0]
+                x, y, z = share * moments[row, 1], share * moments[row, 2], share * moments[row, 3]
                 d = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
                 if count == NEIGHBOURS and d >= nearest[count - 1]:
                     continue
                 at = min(count, NEIGHBOURS - 1)
                 while at > 0 and nearest[at - 1] > d:
-                    nearest[at], place[at] = nearest[at - 1], place[at - 1]
+                    nearest[at] = nearest[at - 1]
+                    for a in range(3):
+                        place[at, a] = place[at - 1, a]
                     at -= 1
                 nearest[at] = d
                 place[at, 0], place[at, 1], place[at, 2] = x, y, z
