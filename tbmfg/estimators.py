@@ -209,9 +209,9 @@ def tbm_mse(problem: Problem, progress: Progress, name: str) -> Result:
     f, scans = run.filtered, run.scans
     edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
     out = result(run.seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
-    unheld, nis = np.array(scans.unheld, dtype=bool), np.array(scans.nis)
-    out.innovations[scans.name] = Innovations(edges_ns[np.array(scans.edges, dtype=int)], nis, 6, unheld)
-    count = replace(out.counts[scans.name], used=scans.begun + int((~unheld).sum()), gated=int(unheld.sum()), unused=0)
+    held = np.array(scans.edges, dtype=int)
+    out.innovations[scans.name] = Innovations(edges_ns[held], np.array(scans.nis), 6, np.zeros(len(held), dtype=bool))
+    count = replace(out.counts[scans.name], used=scans.begun + len(held), gated=scans.unheld, unused=0)
     out.counts[scans.name] = replace(count, unused=count.received - count.parts())
     out.warnings += run.warnings
     return out

@@ -173,7 +173,7 @@ def test_scans_without_hold_change_nothing_and_begin_a_new_map_in_the_end():
         dx, P1 = scans.update(dust, x, P)
         assert not dx.any()
         assert P1 is P
-    assert scans.unheld == [True] * LOST
+    assert scans.unheld == LOST
     _, P1 = scans.update(dust, x, P)
     assert scans.begun == 1
     assert_allclose(P1[-6:, -6:], P[:6, :6])  # the new map is known as well as the body was

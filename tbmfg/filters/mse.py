@@ -87,13 +87,15 @@ def enhanced(problem: Problem) -> tuple[Inertial, list[str]]:
 
 def _of_scans(scans: ScanMap) -> list[str]:
     """What became of the scans, where it is not as usual."""
-    count, unheld = len(scans.edges), sum(scans.unheld)
-    lines = []
+    count, lines = len(scans.scans), []
     if scans.few:
-        lines.append(f"{scans.few} of {len(scans.scans)} scans hold too few points to be laid on the map")
-    if unheld:
-        begun = f" and {scans.begun - 1 - scans.given_up} times the map was begun anew" if scans.begun > 1 else ""
-        lines.append(f"{unheld} of {count} scans find no hold on the map: the inertial unit alone goes on there{begun}")
+        lines.append(f"{scans.few} of {count} scans hold too few points to be laid on the map")
+    if scans.unheld:
+        anew = scans.begun - 1 - scans.given_up
+        lines.append(
+            f"{scans.unheld} of {count} scans find no hold on the map: the other sensors alone go on there"
+            + (f", and {anew} times the map was begun anew" if anew > 0 else "")
+        )
     if scans.given_up:
         lines.append(
             f"the map was given up {scans.given_up} times, after {tbm.REOPEN} fixes of the prism in a row "

@@ -81,7 +81,8 @@ class Swept(NamedTuple):
 class ScanMap:
     """The scans of one LiDAR in time order, and the map that they make. ``name`` is the sensor's.
 
-    Of each scan that was laid on the map its edge, NIS, and whether it found no hold: ``edges``, ``nis``, ``unheld``.
+    Of each scan that was laid on the map its edge and NIS, ``edges``, ``nis``; and how many were not: ``few`` points,
+    ``unheld`` by the map, ``begun`` a map.
     """
 
     name: str
@@ -90,8 +91,8 @@ class ScanMap:
     switches: OnMap
     edges: list[int] = field(default_factory=list)
     nis: list[float] = field(default_factory=list)
-    unheld: list[bool] = field(default_factory=list)
     few: int = 0
+    unheld: int = 0
     begun: int = 0
     given_up: int = 0
     lost: int = 0
@@ -132,11 +133,10 @@ class ScanMap:
 
     def _carried(self, scan: Swept) -> Floats:
         """(27)-(29): its points (n, 3) in b at its last edge, by the filter's motion from where it last was before."""
-        sensor, inertial = self.scans.sensor, self.inertial
-        points, edges = scan.points, inertial.steps.edges_s
+        sensor, inertial, points = self.scans.sensor, self.inertial, scan.points
         known = [one for one in self.passed if one[0] <= scan.first] or list(self.passed)[:1]
         if scan.t_s is not None and known and known[-1][0] < scan.last:
-            k, x = known[-1]
+            (k, x), edges = known[-1], inertial.steps.edges_s
             path = mechanise(
                 x, edges[k : scan.last + 1], inertial.gyro[k : scan.last], inertial.acc[k : scan.last],
                 inertial.earth_n, inertial.gravity_n,
@@ -162,19 +162,19 @@ class ScanMap:
             if found is None or np.abs((dx - sought)[: POS.stop]).max() > SEARCH * self.map.voxel:
                 found, sought = features.near(thin @ R.T + p, self.map, self.switches.feature_test), dx
             told = self._told(thin, R, p, found)
-            if iteration == 0:
-                self.edges.append(scan.last)
-                self.unheld.append(told is None)
-                self.nis.append(np.nan if told is None else innovation(P, told[0] @ D, told[0] @ told[1])[0])
             if told is None:
-                self.lost += 1
+                self.unheld, self.lost = self.unheld + 1, self.lost + 1
                 return zero, P
             S, e = told
+            if iteration == 0:
+                nis = innovation(P, S @ D, S @ e)[0]
             step, P1 = correct(P, S @ D, S @ (e - D @ dx))  # (39)-(41)
             change, dx = step - dx, step
             if np.abs(change[: POS.stop]).max() < STILL:
                 break
         self.lost = 0
+        self.edges.append(scan.last)
+        self.nis.append(float(nis))
         R, p, _ = relative(x, self.pose, dx)
         self.pose = moved(self.pose, dx[-CLONE:])
         self.map.add(points @ R.T + p)
