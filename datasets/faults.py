@@ -160,8 +160,9 @@ def _measured(messages: Messages) -> tuple[str, NDArray]:
 
 
 def _direction(rng: Generator, values: NDArray) -> NDArray:
-    """A random unit vector as wide as a row of ``values``; 1 or -1 for single ones."""
-    drawn = rng.standard_normal(values.shape[1:])
+    """A random unit vector as wide as a row of ``values``, along the axes that are measured: an odometer's others are
+    always zero. 1 or -1 for single ones."""
+    drawn = rng.standard_normal(values.shape[1:]) * (values != 0).any(axis=0)
     return drawn / np.linalg.norm(drawn)
 
 

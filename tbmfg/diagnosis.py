@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import binary_closing, median_filter
+from scipy.stats import chi2, poisson
 
-from tbmfg.problem import Problem
+from tbmfg.problem import GATE, Problem
 from tbmfg.rig import kind_of
 from tbmfg.state import ROT, Innovations, Interval, Trajectory
 from tbmfg.timeseries import Floats
@@ -15,6 +18,7 @@ VAGUE_HEADING = np.deg2rad(10.0)
 BIASED = 3.0  # sds to one side from which a sensor is called biased
 MEDIAN_ROWS = 9  # of the running median that judges it
 STRETCH = 3  # gated rows in a row from which a stretch of them is worth naming
+CHANCE = 1e-3  # with which rows that are as good as the rig says would look as bad
 
 
 def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
@@ -131,16 +135,49 @@ def biased_in_words(biased: list[tuple[Interval, float]], origin_ns: int) -> lis
     return lines
 
 
-def gated_in_words(stretches: list[Interval], origin_ns: int) -> list[str]:
-    """One line per sensor: how many stretches were gated, and the longest."""
+def gated_in_words(innovations: dict[str, Innovations], stretches: list[Interval], origin_ns: int) -> list[str]:
+    """One line per sensor of which more rows are gated, or one lies farther off, than chance explains: how many, when,
+    how far, and the stretches among them."""
     lines = []
-    for sensor in dict.fromkeys(stretch.sensor for stretch in stretches):
-        own = [s for s in stretches if s.sensor == sensor]
-        longest = max(own, key=lambda s: s.end_ns - s.start_ns)
-        start, end = (longest.start_ns - origin_ns) * 1e-9, (longest.end_ns - origin_ns) * 1e-9
-        which = "from" if len(own) == 1 else f"{len(own)} times, the longest from"
-        lines.append(
-            f"{sensor}: gated for {STRETCH} or more rows on end {which} {start:.1f} to {end:.1f} s; what it says there "
-            "contradicts the rest"
+    for sensor, series in innovations.items():
+        gated, nis, t = series.gated, np.nan_to_num(series.nis), (series.t_ns - origin_ns) * 1e-9
+        expected = (1.0 - GATE) * len(gated)
+        rare = poisson.sf(gated.sum() - 1, expected) < CHANCE
+        if not gated.any() or not (rare or len(nis) * chi2.sf(nis[gated].max(), series.dof) < CHANCE):
+            continue
+        farthest = np.flatnonzero(gated)[np.argmax(nis[gated])]
+        line = (
+            f"{sensor}: {gated.sum()} of {len(gated)} rows gated, where chance gates {expected:.2g}: the first at "
+            f"{t[np.argmax(gated)]:.1f} s, the farthest off by {np.sqrt(nis[farthest]):.2g} sd at {t[farthest]:.1f} s"
         )
+        own = [s for s in stretches if s.sensor == sensor]
+        if own:
+            longest = max(own, key=lambda s: s.end_ns - s.start_ns)
+            start, end = (longest.start_ns - origin_ns) * 1e-9, (longest.end_ns - origin_ns) * 1e-9
+            which = "from" if len(own) == 1 else f"{len(own)} times, the longest from"
+            line += f"; {STRETCH} or more on end {which} {start:.1f} to {end:.1f} s"
+        lines.append(f"{line}; what it says there contradicts the rest")
     return lines
+
+
+def gated_together(stretches: list[Interval], origin_ns: int) -> list[str]:
+    """Say when several sensors are gated at once: what each of them is held against is the IMU."""
+    edges = sorted({t for s in stretches for t in (s.start_ns, s.end_ns)})
+    spans: list[tuple[int, int, set[str]]] = []
+    for start, end in pairwise(edges):
+        sensors = {s.sensor for s in stretches if s.start_ns <= start and s.end_ns >= end}
+        if len(sensors) < 2:
+            continue
+        if spans and spans[-1][1] == start:
+            spans[-1] = (spans[-1][0], end, spans[-1][2] | sensors)
+        else:
+            spans.append((start, end, sensors))
+    if not spans:
+        return []
+    start, end, sensors = max(spans, key=lambda one: one[1] - one[0])
+    which = "from" if len(spans) == 1 else f"{len(spans)} times, the longest from"
+    return [
+        f"imu: {' and '.join(sorted(sensors))} are gated together {which} {(start - origin_ns) * 1e-9:.1f} to "
+        f"{(end - origin_ns) * 1e-9:.1f} s: what they contradict there is the IMU; "
+        "look at its bias, its clock and its mounting"
+    ]

@@ -64,7 +64,8 @@ def result(
         warnings=[
             *diagnosis.unobserved(problem, path, sd),
             *diagnosis.vague_heading(path),
-            *diagnosis.gated_in_words(stretches, problem.t0_ns),
+            *diagnosis.gated_in_words(innovations, stretches, problem.t0_ns),
+            *diagnosis.gated_together(stretches, problem.t0_ns),
             *diagnosis.biased_in_words(biased, problem.t0_ns),
         ],
     )

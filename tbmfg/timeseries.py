@@ -22,7 +22,7 @@ class StreamCounts:
     ``received`` messages were decoded; of these ``duplicate`` repeated a stamp, ``disordered`` came with
     a stamp before their predecessor's (kept, sorted), ``nonfinite`` held a NaN or infinity, and the stamp of
     ``misdated`` ones is not to be believed. Duplicates, non-finite and misdated rows are not in the series.
-    ``undecodable`` never became rows.
+    ``undecodable`` never became rows. ``first_ns`` holds the stamp of the first of each that has one, by name.
     """
 
     received: int = 0
@@ -31,6 +31,7 @@ class StreamCounts:
     nonfinite: int = 0
     misdated: int = 0
     undecodable: int = 0
+    first_ns: dict[str, int] = field(default_factory=dict, compare=False)
 
 
 @dataclass(frozen=True, slots=True)

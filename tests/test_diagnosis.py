@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tbmfg.diagnosis import gated_in_words, gated_stretches
+from tbmfg.diagnosis import gated_in_words, gated_stretches, gated_together
 from tbmfg.estimators import estimate
 from tbmfg.prepare import prepare
 from tbmfg.results import summarise
-from tbmfg.state import Innovations
+from tbmfg.state import Innovations, Interval
 from tests import problems
 
 
@@ -19,12 +19,35 @@ def innovations(gated: list[int]) -> Innovations:
 
 
 def test_only_stretches_are_named():
-    found = gated_stretches({"prism": innovations([0, 1, 1, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1])})
+    series = {"prism": innovations([0, 1, 1, 0, 1, 1, 1, 0, 0, 1, 1, 1, 1])}
+    found = gated_stretches(series)
     assert [(s.start_ns // 10**9, s.end_ns // 10**9) for s in found] == [(4, 6), (9, 12)]
-    [line] = gated_in_words(found, 1_000_000_000)
-    assert "2 times" in line
-    assert "8.0-11.0 s" in line
+    [line] = gated_in_words(series, found, 1_000_000_000)
+    assert "9 of 13 rows gated, where chance gates 0.013: the first at 0.0 s" in line
+    assert "3 or more on end: 2 times, the longest 8.0-11.0 s" in line
     assert gated_stretches({"prism": innovations([1, 1, 0, 1])}) == []
+
+
+def test_what_chance_gates_is_not_named():
+    series = innovations([0, 1, *[0] * 998])
+    series.nis[1] = 17.0  # one of a thousand lies beyond 16.3
+    assert gated_in_words({"prism": series}, [], 0) == []
+    series.nis[1] = 40.0
+    [line] = gated_in_words({"prism": series}, [], 0)
+    assert line.startswith(
+        "prism: 1 of 1000 rows gated, where chance gates 1: the first at 1.0 s, the farthest off by 6.3"
+    )
+
+
+def test_sensors_gated_together_point_at_the_imu():
+    def stretch(sensor, start, end):
+        return Interval(sensor, "gated", start * 10**9, end * 10**9)
+
+    assert gated_together([stretch("prism", 1, 5), stretch("odometer", 6, 8)], 0) == []
+    [line] = gated_together([stretch("prism", 2, 9), stretch("odometer", 4, 6), stretch("magnetometer", 5, 8)], 10**9)
+    assert line.startswith(
+        "imu: magnetometer and odometer and prism are gated together in 1 stretches, the longest 3.0-7.0 s"
+    )
 
 
 def test_an_arm_that_cannot_be_seen_is_explained_by_the_motion():

@@ -198,6 +198,7 @@ def test_disorder_and_duplicates_are_counted_and_put_right(tmp_path):
     write_log(tmp_path / "x.mcap", [points(t_ns)], log_ns={"/prism": START_NS + np.arange(8)})
     series = read_log(tmp_path / "x.mcap").series["/prism"]
     assert series.counts == StreamCounts(received=8, duplicate=2, disordered=2)
+    assert series.counts.first_ns == {"duplicate": START_NS + 20, "disordered": START_NS + 20}
     np.testing.assert_array_equal(series.t_ns - START_NS, [0, 10, 20, 30, 40, 50])
     np.testing.assert_array_equal(series["point"][:, 0] / 3, [0, 1, 3, 2, 5, 7])  # the first of each stamp
 

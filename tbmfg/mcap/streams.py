@@ -178,13 +178,21 @@ def _in_time_order(
     index = index[np.argsort(t_ns[index], kind="stable")]
     first = np.ones(len(index), dtype=bool)
     first[1:] = np.diff(t_ns[index]) > 0
+    duplicate = np.zeros(len(t_ns), dtype=bool)
+    duplicate[index[~first]] = True
+    found = {
+        "duplicate": duplicate,
+        "disordered": np.diff(t_ns, prepend=t_ns[:1]) < 0,
+        "nonfinite": ~finite,
+        "misdated": finite & wrong,
+    }
     counts = StreamCounts(
         received=len(t_ns),
-        duplicate=int((~first).sum()),
-        disordered=int((np.diff(t_ns) < 0).sum()),
-        nonfinite=int((~finite).sum()),
-        misdated=int((finite & wrong).sum()),
+        **{what: int(rows.sum()) for what, rows in found.items()},
         undecodable=undecodable,
+        first_ns={
+            what: int(t_ns[np.argmax(rows)]) for what, rows in found.items() if rows.any() and what != "misdated"
+        },
     )
     return index[first], counts
 

@@ -13,8 +13,8 @@ import numpy as np
 from tbmfg import gnss
 from tbmfg.errors import EstimationError, RigError
 from tbmfg.inertial.steps import to_ns
-from tbmfg.prepare import enhance, magnetic, scans, search
-from tbmfg.prepare.samples import ALONE, imu_steps, is_position, losses, usable_samples
+from tbmfg.prepare import enhance, magnetic, scans, search, stream
+from tbmfg.prepare.samples import ALONE, imu_steps, is_position, usable_samples
 from tbmfg.prepare.start import align, parameters_of
 from tbmfg.problem import Problem, breakdown_explained
 from tbmfg.rig import Rig
@@ -41,8 +41,10 @@ def prepare(
         if name not in rig.sensors:
             raise RigError(f"no sensor {name!r} in rig {rig.name!r}; it has {', '.join(rig.sensors)}")
     log, rig, said = gnss.into_n(log, rig)
-    warnings: list[str] = [*log.damage, *losses(log, rig, without), *said]
+    warnings: list[str] = [*log.damage, *said]
     measured, imu_counts = imu_steps(log, rig, outages, warnings)
+    silent, gaps = stream.gaps(log, rig, without, outages, measured.t0_ns)
+    warnings += [*stream.losses(log, rig, without, measured.t0_ns), *gaps]
     steps = enhance.denoised(rig, measured, warnings)
     missing: list[str] = []
     samples, counts = usable_samples(log, rig, steps, outages, without, missing)
@@ -64,6 +66,7 @@ def prepare(
         problem.measured, problem.scans = measured, setup.scans
     problem.intervals = [
         *setup.intervals,
+        *silent,
         *(Interval("imu", "gap", *(int(t) for t in to_ns(steps, np.array(gap)))) for gap in steps.gaps),
         *(Interval(name, "outage", *(int(t) for t in to_ns(steps, np.array([a, b])))) for name, a, b in outages),
         *(

@@ -18,6 +18,7 @@ from tbmfg.timeseries import Floats
 FASTEST = 5 * STANDARD_GRAVITY  # m/s^2: no machine's speed changes faster; an encoder's that rolls over does
 NOISE = 10.0  # sds of an odometer's noise that are no jump either
 STUCK = 10  # readings in a row that are equal to the last digit
+CHANCE = 1e-3  # with which readings that do not hang would repeat as long
 PILE = 3  # times as many readings at the end of the scale as at the next value inside: noise thins out, limits do not
 HUNG_S = 2.0  # for longer than this no spot stays the same to the last digit
 EDGE = 1e-3  # of the detector's half width: a spot that near its edge, or beyond, is not on it
@@ -33,13 +34,20 @@ def check(sensor: Sensor, samples: Samples) -> Sound:
     if isinstance(sensor, Magnetometer):
         return magnetometer(samples.t_s, samples.values)
     if isinstance(sensor, Barometer):
-        return barometer(samples.values)
+        return barometer(samples.t_s, samples.values)
     if isinstance(sensor, Laser):
         return laser(samples.t_s, samples.values, sensor.half_width)
     return np.ones(len(samples.t_s), dtype=bool), []
 
 
 def odometer(t_s: Floats, speed: Floats, sigma: float) -> Sound:
+    """Leaves out speeds (n,) that jump, and those of an encoder that hangs on one; it may read zero for long."""
+    hung, said = hangs(t_s, speed, speed == 0.0)
+    moving, jumps = _jumps(t_s, speed, sigma)
+    return ~hung & moving, [*said, *jumps]
+
+
+def _jumps(t_s: Floats, speed: Floats, sigma: float) -> Sound:
     """Leaves out speeds (n,) far from the median of the five about them: an encoder's roll-over, a broken message.
 
     None where most are so: then the unit is wrong, or the clock.
@@ -97,12 +105,36 @@ def magnetometer(t_s: Floats, field: Floats) -> Sound:
     return sound, said
 
 
-def barometer(height: Floats) -> Sound:
-    """Leaves out all heights (n,) where they are one: a barometer that is read faster than it converts repeats some."""
+def barometer(t_s: Floats, height: Floats) -> Sound:
+    """Leaves out all heights (n,) where they are one, and those on which it hangs: one that is read faster than it
+    converts repeats some."""
     if len(height) < STUCK or np.ptp(height) > 0:
-        return np.ones(len(height), dtype=bool), []
+        hung, said = hangs(t_s, height, np.zeros(len(height), dtype=bool))
+        return ~hung, said
     return np.zeros(len(height), dtype=bool), [
         f"all {len(height)} samples are the same, {height[0]:.2f} m in the standard atmosphere: it is stuck; left out"
+    ]
+
+
+def hangs(t_s: Floats, values: Floats, resting: NDArray[np.bool_]) -> Sound:
+    """The readings (n,) in the longest run that repeats to the last digit, but its first, where it is longer than the
+    other readings explain; and a line. Runs of ``resting`` readings are none.
+
+    With a share p of repeats outside the run, one as long as r comes about n p^r times by chance.
+    """
+    repeats = np.concatenate([[False], (np.diff(values) == 0) & ~resting[1:]])
+    hung = np.zeros(len(values), dtype=bool)
+    if not repeats.any():
+        return hung, []
+    first, last = max(_runs(repeats), key=lambda run: run[1] - run[0])
+    run = last - first
+    share = (repeats.sum() - run + 1) / (len(values) - run + 1)
+    if run < STUCK or np.log(len(values)) + run * np.log(share) > np.log(CHANCE):
+        return hung, []
+    hung[first:last] = True
+    return hung, [
+        f"hangs on one reading: {run} of {len(values)} samples repeat the one before from {t_s[first - 1]:.1f} to "
+        f"{t_s[last - 1]:.1f} s; left out"
     ]
 
 

@@ -156,23 +156,6 @@ def hidden(name: str, t_s: Floats, outages: tuple[tuple[str, float, float], ...]
     return out
 
 
-def losses(log: Log, rig: Rig, without: tuple[str, ...]) -> list[str]:
-    """What the reader left out of the sensors' messages and the counts do not name."""
-    said = []
-    for name, sensor in rig.sensors.items():
-        source = log.series.get(sensor.topic, log.clouds.get(sensor.topic))
-        if source is None or name in without:
-            continue
-        for count, what in (
-            (source.counts.misdated, "bear a stamp that cannot be right"),
-            (source.counts.undecodable, "cannot be decoded"),
-        ):
-            if count:
-                total = source.counts.received + source.counts.undecodable
-                said.append(f"{name}: {count} of {total} messages on {sensor.topic} {what}; left out")
-    return said
-
-
 def absence(log: Log, kind: str, topic: str) -> str:
     """Why there are no samples of a topic, and what could be meant."""
     if topic in log.unknown:
