@@ -20,6 +20,8 @@ z_..                   error of a calibration over its sd: mean 0, sd 1 expected
 nis_.., gated_..       mean squared normalised residual per degree of freedom of what was accepted, and the share
                        that was not; below 1 in a smoother, whose residuals have had the data fitted to them
 failed                 seeds without a result
+
+``--corrupt`` asks instead what becomes of logs with faults drawn at random; see :mod:`benchmarks.corrupt`.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from benchmarks import corrupt
 from benchmarks.gate import Tolerance
 from benchmarks.rows import Row
 from benchmarks.runs import Job, Measured, run
@@ -58,6 +61,7 @@ GATE = {
     "duration": 30.0,
     "epochs": 3,
     "assignments": [],
+    "corrupt": False,
     "without": "",
     "estimators": "batch,ins",
 }
@@ -73,6 +77,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--estimators", default="batch,ins", metavar="A,B", help="(batch,ins)")
     parser.add_argument("--without", default="", metavar="A,B", help="sensors that the estimators do not get")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (2)")
+    parser.add_argument("--corrupt", action="store_true", help="faults drawn at random: does every log end well?")
     parser.add_argument(
         "--set",
         action="append",
@@ -85,6 +90,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def measure(given: argparse.Namespace) -> list[Row]:
     """Rows of all scenarios; failed seeds are told on stderr."""
+    if given.corrupt:
+        return survived(given)
     scenarios = given.scenario or list(SCENARIOS)
     jobs = [job for scenario in scenarios for job in make_jobs(scenario, given)]
     measured = [one for group in run_all(run, jobs, given.jobs, "accuracy") for one in group]
@@ -97,14 +104,34 @@ def measure(given: argparse.Namespace) -> list[Row]:
     return [row for group in groups for row in summarise(group, alpha)]
 
 
-def make_jobs(scenario: str, given: argparse.Namespace) -> list[Job]:
-    """One job per seed."""
+def survived(given: argparse.Namespace) -> list[Row]:
+    """What became of corrupted logs, machines by turns; what should not have is told on stderr."""
+    names, seeds = known_estimators(given), range(given.first_seed, given.first_seed + given.seeds)
+    machines = given.scenario or corrupt.DATASETS
+    if unknown := [name for name in machines if name not in MACHINES]:
+        raise TbmfgError(f"--corrupt: no dataset {', '.join(unknown)}; there are {', '.join(MACHINES)}")
+    jobs = [corrupt.Job(machines[seed % len(machines)], seed, given.duration, names) for seed in seeds]
+    ended = [one for group in run_all(corrupt.run, jobs, given.jobs, "corrupted logs") for one in group]
+    for one in ended:
+        if one.said:
+            print(f"{one.dataset}, {one.estimator}, seed {one.seed}: {one.outcome}: {one.said}", file=sys.stderr)
+    return corrupt.rows(ended)
+
+
+def known_estimators(given: argparse.Namespace) -> tuple[str, ...]:
+    """Those asked for. Raises TbmfgError for a name that does not exist."""
     from tbmfg.estimators import ESTIMATORS
 
     estimators = tuple(given.estimators.split(","))
     unknown = [name for name in estimators if name not in ESTIMATORS]
     if unknown:
         raise TbmfgError(f"no estimator {', '.join(unknown)}; there are {', '.join(ESTIMATORS)}")
+    return estimators
+
+
+def make_jobs(scenario: str, given: argparse.Namespace) -> list[Job]:
+    """One job per seed."""
+    estimators = known_estimators(given)
     if scenario not in SCENARIOS and scenario not in MACHINES:
         raise TbmfgError(f"{scenario}: no such scenario; there are {', '.join({**SCENARIOS, **MACHINES})}")
     if min(given.seeds, given.epochs, given.jobs) < 1:
