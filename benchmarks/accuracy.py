@@ -110,6 +110,8 @@ def survived(given: argparse.Namespace) -> list[Row]:
     machines = given.scenario or corrupt.DATASETS
     if unknown := [name for name in machines if name not in MACHINES]:
         raise TbmfgError(f"--corrupt: no dataset {', '.join(unknown)}; there are {', '.join(MACHINES)}")
+    if min(given.seeds, given.jobs) < 1:
+        raise TbmfgError(f"--seeds {given.seeds} --jobs {given.jobs}: each should be 1 or more")
     jobs = [corrupt.Job(machines[seed % len(machines)], seed, given.duration, names) for seed in seeds]
     ended = [one for group in run_all(corrupt.run, jobs, given.jobs, "corrupted logs") for one in group]
     for one in ended:

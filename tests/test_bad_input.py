@@ -161,7 +161,7 @@ def test_a_corrupt_chunk_is_lost_and_counted(write, topic):
     everything = sum(len(one) for one in topic.values())
     read = sum(len(one) for one in read_log(path).series.values())
     assert read + messages == everything
-    assert "imu: gaps: 1, " in only_warning(summary, "imu: ")
+    assert "imu: gaps: 1, " in only_warning(summary, "imu: gaps")
 
 
 def write_raw(path, imu, *, message_encoding="cdr", schema_encoding="ros2msg", name=None, text=b"", payload=None):
@@ -284,7 +284,7 @@ def test_nan_stretches_are_bridged_and_counted(write, topic):
     summary = run(write({IMU: changed(topic[IMU], gyro=gyro), PRISM: changed(topic[PRISM], point=point)}))
     assert summary["sensors"]["imu"]["nonfinite"] == 950
     assert summary["sensors"]["prism"]["nonfinite"] == 20
-    assert "imu: gaps: 1, 2 s together, the longest 2 s at 18.95 s" in only_warning(summary, "imu: ")
+    assert "imu: gaps: 1, 2 s together, the longest 2 s at 18.95 s" in only_warning(summary, "imu: gaps")
     assert summary["metrics"]["position_rms_m"] < 0.1
 
 
@@ -340,7 +340,7 @@ def test_repeated_stamps_are_counted(write, topic):
 def test_a_pause_is_bridged_and_said(write, topic):
     imu = topic[IMU]
     summary = run(write({IMU: restamped(imu, slice(12_000, None), imu.t_ns[12_000:] + 60 * NS)}))
-    assert "imu: gaps: 1, 60 s together" in only_warning(summary, "imu: ")
+    assert "imu: gaps: 1, 60 s together" in only_warning(summary, "imu: gaps")
 
 
 def test_a_sensor_on_another_clock(write, topic):
@@ -407,7 +407,7 @@ def test_contradicting_sensors_are_gated_and_said(write, topic, estimator):
     nonsense = 1e4 * np.random.default_rng(0).standard_normal(topic[PRISM]["point"].shape)
     summary = run(write({PRISM: changed(topic[PRISM], point=nonsense)}), "--estimator", estimator)
     counts = summary["sensors"]["prism"]
-    assert f"{counts['gated']} of 150 samples contradict the estimate" in only_warning(summary, "prism: 1")
+    assert only_warning(summary, f"prism: {counts['gated']} of 150 samples contradict the estimate")
 
 
 @pytest.mark.parametrize(

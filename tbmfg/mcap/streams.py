@@ -178,11 +178,13 @@ def _in_time_order(
     index = index[np.argsort(t_ns[index], kind="stable")]
     first = np.ones(len(index), dtype=bool)
     first[1:] = np.diff(t_ns[index]) > 0
-    duplicate = np.zeros(len(t_ns), dtype=bool)
+    duplicate, disordered = np.zeros(len(t_ns), dtype=bool), np.zeros(len(t_ns), dtype=bool)
     duplicate[index[~first]] = True
+    dated = np.flatnonzero(~wrong)
+    disordered[dated[1:]] = np.diff(t_ns[dated]) < 0
     found = {
         "duplicate": duplicate,
-        "disordered": np.diff(t_ns, prepend=t_ns[:1]) < 0,
+        "disordered": disordered,
         "nonfinite": ~finite,
         "misdated": finite & wrong,
     }
