@@ -18,6 +18,7 @@ from __future__ import annotations
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "attitude": "benchmarks.attitude",
+    "clock": "benchmarks.clock",
     "gyrocompass": "benchmarks.gyrocompass",
     "reckoning": "benchmarks.reckoning",
     "height": "benchmarks.height",

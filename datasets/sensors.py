@@ -38,11 +38,10 @@ def imu(scene: Scene, sensor: Imu, rng: np.random.Generator, *, rate_hz: float) 
     edges_ns = ticks(scene.duration_s, rate_hz)
     ideal = period_means(scene.inertial, edges_ns)
     dt = 1 / rate_hz
-    factor = 1.0 if sensor.noise_factor == "auto" else sensor.noise_factor
     density, walk, bias_sd = (
         np.repeat(pair, 3)
         for pair in (
-            (factor * sensor.gyro_density, factor * sensor.acc_density),
+            (sensor.times * sensor.gyro_density, sensor.times * sensor.acc_density),
             (sensor.gyro_walk, sensor.acc_walk),
             (sensor.gyro_bias_sd, sensor.acc_bias_sd),
         )
@@ -90,7 +89,7 @@ def prism(
 
     position, _ = scene.motion(t_ns * 1e-9).at_point(arm)
     distance = np.linalg.norm(position - np.array(sensor.station_m), axis=1, keepdims=True)
-    sigma = 1e-3 * sensor.sigma_mm + 1e-6 * sensor.sigma_ppm * distance
+    sigma = sensor.times * (1e-3 * sensor.sigma_mm + 1e-6 * sensor.sigma_ppm * distance)
 
     def series(offset_s: float, point: Floats) -> Series:
         stamps = START_NS + t_ns + round(offset_s * NS)
@@ -125,7 +124,7 @@ def odometer(
 
     true = period_means(speed, edges_ns, panel_s=1 / rate_hz)[:, 0]
     scale = sensor.scale + sensor.scale_sd * rng.standard_normal()
-    measured = (1 + scale) * true + sensor.sigma_mps * rng.standard_normal(len(true))
+    measured = (1 + scale) * true + sensor.times * sensor.sigma_mps * rng.standard_normal(len(true))
     drawn = {"scale": scale}
     if slips > 0:
         at, length, excess = rng.random((slips, 3)).T * [[scene.duration_s], [2.0], [0.3]] + [[0.0], [1.0], [0.2]]
@@ -172,7 +171,7 @@ def magnetometer(
     # in b first, then in the sensor's axes; the machine's own field is fixed in the latter
     motion = scene.motion(t_ns * 1e-9)
     clean = field_n @ motion.R @ sensor.R_bm + 1e-6 * np.array(sensor.hard_iron_ut)
-    sigma = np.radians(sensor.sigma_deg) * field_t * np.cos(dip) if noise_t is None else noise_t
+    sigma = sensor.times * (np.radians(sensor.sigma_deg) * field_t * np.cos(dip) if noise_t is None else noise_t)
     white = rng.standard_normal(clean.shape)
     axis, phase = rng.standard_normal(3), 2 * np.pi * rng.random(2)
     load = 1 + 0.5 * np.sin(2 * np.pi * LOAD_HZ * t_ns * 1e-9 + phase[0])
@@ -238,7 +237,7 @@ def barometer(
     clean = column(depth)
     if noise_pa is None:
         walk = sensor.bias_walk / np.sqrt(rate_hz) * np.cumsum(steps)
-        error_m = sensor.sigma_m * white + walk
+        error_m = sensor.times * sensor.sigma_m * white + walk
         measured, offset_s = clean + per_metre * error_m, sensor.clock_offset_s
     else:
         converted = np.floor(np.arange(len(t_ns)) * update_hz / rate_hz + 1e-9).astype(int)
@@ -283,7 +282,7 @@ def laser(
     tilt, zero = np.array([[sensor.tilt_sd], [sensor.offset_sd]]) * rng.standard_normal((2, 2))
     *white, dust = rng.standard_normal((len(t_ns), 3)).T
     spot = spot_on_detector(truth, np.array(sensor.T_bd.xyz_m), sensor.T_bd.R, np.append(tilt, 1.0))
-    noisy = spot + zero + 1e-3 * sensor.sigma_mm * np.column_stack(white)
+    noisy = spot + zero + 1e-3 * sensor.times * sensor.sigma_mm * np.column_stack(white)
     read = np.clip(resolution_m * np.round(noisy / resolution_m), -half_width_m, half_width_m)
     seen = ndtr(dust) >= dropout
 

@@ -70,6 +70,16 @@ def si(field: str, unit: float = 1.0) -> property:
     return property(value, doc=f"``{field}`` in SI.")
 
 
+def noise(field: str, unit: float = 1.0) -> property:
+    """``field``, a sensor's noise, in SI and times its ``noise_factor``; None where it is null."""
+
+    def value(self: Node) -> float | None:
+        given = getattr(self, field)
+        return None if given is None else given * unit * self.times
+
+    return property(value, doc=f"``{field}`` in SI, times the noise factor.")
+
+
 class Node(BaseModel):
     """A mapping of the rig file: frozen, unknown keys refused."""
 

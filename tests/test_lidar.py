@@ -137,7 +137,7 @@ def test_a_tunnel_tells_all_but_the_way_along_it():
     assert_allclose(found.p[1:], p[1:], atol=4e-3)
     assert_allclose(found.R, R, atol=2e-3)
     assert found.overlap > 0.95
-    S = whitening(found.information, 1.0)
+    S = whitening(found.information)
     assert np.linalg.svd(S)[1][-1] < 1e-12 * np.linalg.svd(S)[1][0]
 
 

@@ -225,7 +225,7 @@ class ScanMap:
         strength = np.where(weak, 0.0, ratio - 1.0) * share / sigma**2
         off = V @ np.where(weak, 0.0, V.T @ g / ratio)
         information = inverse.T @ (strength[:, None] * inverse)
-        return whitening(information, 1.0, (self.switches.scan_turn, self.switches.scan_sd)), off
+        return whitening(information, (self.switches.scan_turn, self.switches.scan_sd)), off
 
 
 def relative(x: Floats, pose: Floats, dx: Floats) -> tuple[Floats, Floats, Floats]:

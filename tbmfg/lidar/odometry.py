@@ -133,7 +133,7 @@ class Odometry:
         self.unfit = 0
         if self.last.placed:
             self._learn_velocity(t_s, found)
-        root = whitening(found.information, self.sensor.noise_factor)
+        root = whitening(found.information)
         weak = found.weak.shape[1]
         self._extend(found.R, found.p, points, dense)
         self.last = Pose(t_s, found.R, found.p, root, found.overlap, found.sigma, weak, found.dust, True, True)
@@ -202,12 +202,12 @@ def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Bl
         yield odometry.register(scan, start_s)
 
 
-def whitening(information: Floats, noise_factor: float, least_sd: tuple[float, float] = NEAREST_SD) -> Floats:
+def whitening(information: Floats, least_sd: tuple[float, float] = NEAREST_SD) -> Floats:
     """Square root S of an information matrix, S' S, with sds no smaller than the least ones, rad and m; (6, 6)."""
     scale = np.repeat(least_sd, 3)
     value, vector = np.linalg.eigh(information * np.outer(scale, scale))
     value = np.where(value > 1e-12 * max(value[-1], 1.0), value, 0.0)  # what rounding leaves of a weak direction
-    return (np.sqrt(value / (1.0 + value)) / noise_factor)[:, None] * vector.T / scale
+    return np.sqrt(value / (1.0 + value))[:, None] * vector.T / scale
 
 
 def matrix(R: Floats, p: Floats) -> Floats:

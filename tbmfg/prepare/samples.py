@@ -186,5 +186,5 @@ def sigma_of(sensor: Sensor, series: Series, values: Floats) -> Floats | None:
     if not isinstance(sensor, PositionSensor):
         return None
     if isinstance(sensor, Gnss):
-        return series["sigma"]
-    return np.tile(np.reshape(sensor.sigma_at(values), (len(values), -1)), (1, 3))[:, :3]
+        return sensor.times * series["sigma"]
+    return sensor.times * np.tile(np.reshape(sensor.sigma_at(values), (len(values), -1)), (1, 3))[:, :3]

@@ -160,7 +160,8 @@ def lidar_rows(sensor: Lidar, poses: Samples, keyframes_s: Floats, setup: Setup,
         ]
     )
     ones = np.ones(len(told), dtype=int)
-    return Rows(poses.sensor, "lidar", i, j, z, data, np.ones((len(told), 6)), calib, ones, sensor.loss)
+    sigma = np.full((len(told), 6), sensor.times)
+    return Rows(poses.sensor, "lidar", i, j, z, data, sigma, calib, ones, sensor.loss)
 
 
 def _sway(setup: Setup) -> tuple[Floats, Floats]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from tbmfg.filters import ins
 from tbmfg.inertial import alignment
 from tbmfg.inertial.noise import spectral_floor
+from tbmfg.prepare import noise
 from tbmfg.prepare.build import build
 from tbmfg.prepare.start import Setup
 from tbmfg.problem import Problem
@@ -16,6 +18,7 @@ from tbmfg.smoother import batch
 from tbmfg.state import Calibrated
 from tbmfg.timeseries import Floats
 
+TURNS = 3  # of finding the noise of the IMU beside that of the others, which are known the better for it
 REACH_SD = 3.0  # sds of its prior within which a clock offset is looked for
 SEARCH_S = 300.0  # offset and noise factor are found on at most this much of a log
 FACTOR_RANGE = (1.0, 1e3)  # a data sheet is the best that a unit does; beyond the upper end it is not the unit
@@ -38,12 +41,18 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
     unknown = [n for n in offsets if setup.parameters.sd[names.index(f"{n}.clock_offset")] > 0]
     for name in unknown:
         offsets[name] = _coarse_offset(setup, name)
-    for turn in range(2 if auto and unknown else 1):
+    noisy = [name for name in setup.samples if setup.rig.sensors[name].noise_factor == "auto"]
+    found: dict[str, Calibrated] = {}
+    for turn in range(TURNS if auto and noisy else 2 if auto and unknown else 1):
         if unknown:
             offset_sd = _settle_offsets(setup, offsets, scale * split, unknown)
         if auto:
             scale, sd = _noise_scale(setup, offsets, split, scale)
-        tell("prepare", 0.5 + 0.25 * turn)
+        if noisy:
+            beside = noise.factors(build(setup, offsets, scale * split, SEARCH_S), noisy)
+            found = {name: _times(found.get(name), factor) for name, factor in beside.items()}
+            _rescale(setup, {name: factor.value for name, factor in beside.items()})
+        tell("prepare", 0.5 + 0.25 * turn / 2)
     factors = np.maximum(scale * split, 1.0) if auto else scale * split
     if unknown:
         offset_sd = _smooth_offsets(setup, offsets, factors, unknown)
@@ -51,9 +60,26 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
     named = {"noise_factor_gyro": factors[0], "noise_factor_acc": factors[1], "noise_factor": np.sqrt(np.prod(factors))}
     for key, value in named.items():
         problem.calibration[key] = Calibrated(float(value), float(value * sd / scale), auto)
+    problem.calibration |= {f"{name}_noise_factor": factor for name, factor in found.items()}
     for name in unknown:
         problem.calibration[f"{name}_clock_offset_s"] = Calibrated(offsets[name], offset_sd[name], True)
     return problem
+
+
+def _times(before: Calibrated | None, factor: Calibrated) -> Calibrated:
+    """``factor``, found on top of the one before."""
+    times = 1.0 if before is None else before.value
+    return Calibrated(times * factor.value, times * factor.sd, True)
+
+
+def _rescale(setup: Setup, factors: dict[str, float]) -> None:
+    """Multiply the noise of sensors, in their entries in the rig and in their samples, in place."""
+    sensors = dict(setup.rig.sensors)
+    for name, factor in factors.items():
+        sensors[name] = sensors[name].model_copy(update={"noise_factor": factor * sensors[name].times})
+        s = setup.samples[name]
+        setup.samples[name] = s if s.sigma is None else replace(s, sigma=factor * s.sigma)
+    setup.rig = setup.rig.model_copy(update={"sensors": sensors})
 
 
 def _settle_offsets(setup: Setup, offsets: dict[str, float], factors: Floats, unknown: list[str]) -> dict[str, float]:

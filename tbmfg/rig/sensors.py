@@ -25,6 +25,7 @@ from tbmfg.fields import (
     Positive,
     Text,
     Triple,
+    noise,
     si,
 )
 from tbmfg.registry import Registry
@@ -55,6 +56,15 @@ class Sensor(Node):
     """What every sensor has: the topic it is recorded under."""
 
     topic: Text = Field(description="Topic in the log.")
+    noise_factor: NoiseFactor = Field(
+        1.0,
+        description="Multiplies the sensor's own noise; auto: found from the log, by what the smoother leaves of it.",
+    )
+
+    @property
+    def times(self) -> float:
+        """The noise factor; 1 while it is still to be found."""
+        return 1.0 if self.noise_factor == "auto" else self.noise_factor
 
 
 class Enhancement(Node):
@@ -181,7 +191,7 @@ class Odometer(Sensor):
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
-    sigma = si("sigma_mps")
+    sigma = noise("sigma_mps")
     lateral_sigma = si("lateral_sigma_mps")
     arm = si("arm_m")
     yaw = si("yaw_deg", DEG)
@@ -211,7 +221,7 @@ class Magnetometer(Sensor):
     clock_offset_sd_s: CalibrationSd = Field(0.0, description="0 or null: the offset is not looked for in the log.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
-    sigma = si("sigma_deg", DEG)
+    sigma = noise("sigma_deg", DEG)
     disturbance = si("disturbance_deg", DEG)
     disturbance_time = si("disturbance_s")
     declination = si("declination_deg", DEG)
@@ -243,7 +253,7 @@ class Barometer(Sensor):
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
-    sigma = si("sigma_m")
+    sigma = noise("sigma_m")
     bias_sd = si("bias_sd_m")
     lapse_sd = si("lapse_sd_kpkm", 1e-3)
     clock_offset = si("clock_offset_s")
@@ -272,7 +282,7 @@ class Laser(Sensor):
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time.")
     loss: Loss = Field("huber", description="Weight of outliers, such as light scattered by dust, in the graph.")
 
-    sigma = si("sigma_mm", MM)
+    sigma = noise("sigma_mm", MM)
     line = si("line_m")
     tilt = si("tilt_deg", DEG)
     tilt_sd = si("tilt_sd_deg", DEG)
@@ -293,7 +303,6 @@ class Lidar(Sensor):
     min_range_m: NotNegative = Field(0.5, description="Nearer points are the machine itself.")
     max_range_m: Positive = Field(100.0, description="Farther points are not used.")
     voxel_m: Positive = Field(0.5, description="Size of the pieces that surfaces are cut into.")
-    noise_factor: Positive = Field(1.0, description="Multiplies the sds of the odometry.")
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
     xyz_sd = si("T_bl_xyz_sd_m")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -112,6 +112,26 @@ def at(problem: Problem, x: Floats, c: Floats) -> Smoothed:
     blocks, nis, _ = _linearise(problem, imu, states, free)
     cov, c_cov = _covariances(problem, blocks, free)
     return Smoothed(x, cov, c, c_cov, nis, 0, True)
+
+
+def residual_traces(problem: Problem, x: Floats, c: Floats, sensor: str, which: slice) -> tuple[float, float]:
+    """tr R_ss and tr(R_ss^2) of the adjustment of all rows at a solution, over components ``which`` of the rows of
+    ``sensor``: R = I - H is what it leaves of an error. By a random probe of signs (Hutchinson 1990), whose error is
+    that of one draw of noise, or less."""
+    free, states = problem.parameters.free, States(x, c)
+    imu = graph.imu_graph(problem, x), graph.no_bias(len(x))
+    blocks, _, _ = _linearise(problem, imu, states, free)
+    own = len(blocks) - len(problem.rows) + [rows.sensor for rows in problem.rows].index(sensor)
+    signs = np.zeros_like(blocks[own].b)
+    signs[:, which] = np.random.default_rng(0).choice([-1.0, 1.0], size=signs[:, which].shape)
+    probed = [replace(block, b=signs if k == own else np.zeros_like(block.b)) for k, block in enumerate(blocks)]
+    dx, dc = eliminate(probed, len(x), problem.size, len(free)).solve()
+    block = blocks[own]
+    fitted = np.einsum("rka,ra->rk", block.A_i, dx[block.i]) + block.A_c @ dc
+    if block.A_j is not None:
+        fitted += np.einsum("rka,ra->rk", block.A_j, dx[block.i + 1])
+    left = (signs - fitted)[:, which]
+    return float(np.sum(signs[:, which] * left)), float(np.sum(left**2))
 
 
 def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tuple[Floats, Floats]:

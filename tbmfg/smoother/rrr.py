@@ -49,7 +49,7 @@ def trusted(rows: Rows, switches: RrrMf) -> Rows:
     """Steps of LiDAR odometry with the switches' covariance in place of their own."""
     data = rows.data.copy()
     data[:, ROOT] = np.diag(1.0 / np.repeat([switches.turn, switches.sigma], 3)).ravel()
-    return replace(rows, data=data, loss="none")
+    return replace(rows, data=data, sigma=np.ones_like(rows.sigma), loss="none")
 
 
 def solve(x: Floats, cov: Floats, steps: list[Rows], c: Floats) -> Fused:
