@@ -16,6 +16,7 @@ nees_pose@T            squared error of the 6-dof pose over its covariance at T 
                        leave theirs by chance in 1 % of the commands
 nees_rotation ..       the same for three components each, mean over the epochs of a run: 1 expected
 within_1sd ..          share of the errors of rotation and position within 1, 2, 3 sd: 68.3, 95.4, 99.7 % expected
+calibrations_within_3sd  share of all calibrations of all seeds, 99.7 % expected, held to CALIBRATED
 z_..                   error of a calibration over its sd: mean 0, sd 1 expected (gyro bias: at the end)
 nis_.., gated_..       mean squared normalised residual per degree of freedom of what was accepted, and the share
                        that was not; below 1 in a smoother, whose residuals have had the data fitted to them
@@ -53,6 +54,7 @@ NOMINAL = ("tbm-drive-nominal", "shearer-cut", "shaft-descend-nominal")
 LIMITS = {"batch": 1.05, "ins": 1.15}  # of errors over their bounds
 JUDGED = ("position", "attitude")
 CONFIDENCE = 1.645  # standard errors below the mean that 95 % lie above
+CALIBRATED = 99.0  # % of calibrations within 3 sd
 CHANCE = 0.01  # of a false alarm in all NEES cells of a command together
 GATE = {
     "scenario": ["tbm-drive", "tbm-drive-nominal"],
@@ -184,6 +186,11 @@ def summarise(measured: list[Measured], alpha: float) -> list[Row]:
         rows.append(row(f"within_{k}sd", "%", within))
     for name in dict.fromkeys(key for one in good for key in one.z):
         rows.append(row(f"z_{name}", "sd", (one.z[name] for one in good if name in one.z)))
+    scores = np.array([z for one in good for name, z in one.z.items() if not name.startswith("bias_")])
+    if len(scores):
+        share = 100.0 * float(np.mean(np.abs(scores) < 3.0))
+        bound = (CALIBRATED, None) if scenario in NOMINAL else None
+        rows.append(Row(scenario, estimator, "calibrations_within_3sd", "%", share, None, len(scores), bound))
     return rows
 
 

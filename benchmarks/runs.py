@@ -25,6 +25,15 @@ ERRORS = {  # metric, unit and factor of what tbmfg.evaluation.evaluate returns
     "tilt_rms_deg": ("tilt", "deg", 1.0),
     "velocity_rms_mps": ("velocity", "mm/s", 1e3),
 }
+# what the simulators draw: the name and the unit that its calibration has
+DRAWN = {
+    "arm_m": ("lever_arm_m", 1.0),
+    "clock_offset_s": ("clock_offset_s", 1.0),
+    "scale": ("scale", 1.0),
+    "hard_iron_ut": ("hard_iron_ut", 1.0),
+    "tilt_n": ("tilt_deg", np.rad2deg(1.0)),
+    "zero_m": ("offset_m", 1.0),
+}
 PARTS = {"rotation": 0, "position": 3, "velocity": 6, "bias_acc": 9, "bias_gyro": 12}  # where each begins in cov
 
 
@@ -192,15 +201,14 @@ def point_errors(
 
 def calibration_z(simulation: Simulation, result: Result) -> dict[str, float]:
     """(estimate - drawn) / sd of every calibration that is estimated and whose true value was drawn."""
-    named = {"arm_m": "lever_arm_m", "clock_offset_s": "clock_offset_s", "scale": "scale"}
     z = {}
     for sensor, drawn in simulation.drawn.items():
-        for drawn_name, name in named.items():
+        for drawn_name, (name, unit) in DRAWN.items():
             found = result.calibration.get(f"{sensor}_{name}")
             if drawn_name not in drawn or found is None or not found.estimated:
                 continue
-            scores = np.atleast_1d((np.array(found.value) - drawn[drawn_name]) / np.array(found.sd))
-            labels = [f"_{axis}" for axis in "xyz"] if len(scores) == 3 else [""]
+            scores = np.atleast_1d((np.array(found.value) - unit * drawn[drawn_name]) / np.array(found.sd))
+            labels = [f"_{axis}" for axis in "xyz"[: len(scores)]] if len(scores) > 1 else [""]
             z |= {
                 f"{sensor}_{drawn_name.removesuffix('_m')}{label}": float(s)
                 for label, s in zip(labels, scores, strict=True)

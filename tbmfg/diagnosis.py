@@ -21,6 +21,11 @@ STRETCH = 3  # gated rows in a row from which a stretch of them is worth naming
 CHANCE = 1e-3  # with which rows that are as good as the rig says would look as bad
 
 
+def observed(sd: Floats, prior_sd: Floats) -> np.ndarray:
+    """Whether the log told calibrations more than their priors did, (m,) bool."""
+    return sd <= UNOBSERVED * prior_sd
+
+
 def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
     """Calibrations that the log says nothing of, ``sd`` (m,) being their posterior, and the motion that was missing."""
     parameters = problem.parameters
@@ -29,7 +34,7 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
         sensor, _, what = parameters.names[k].rpartition(".")
         if kind_of(sensor) == "barometer":
             lines += _depth(problem, path, sensor, what, float(sd[k]))
-        elif sd[k] > UNOBSERVED * parameters.sd[k]:
+        elif not observed(sd[k], parameters.sd[k]):
             lines.append(
                 f"{parameters.names[k]} is not observable on this log: its sd stays "
                 f"{sd[k] / parameters.sd[k]:.0%} of the prior's; {_motion(path, what)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -15,6 +16,22 @@ from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats, Times
 
 CONTRADICTING = 0.02  # share of rows beyond the gate, of which chance puts 0.1 % there, from which it is said
+
+DEG = 180.0 / np.pi
+# the first of the parameters that make one calibration: how many they are, its public name, and its unit
+PUBLIC = {
+    "arm_x": (3, "lever_arm_m", 1.0),
+    "clock_offset": (1, "clock_offset_s", 1.0),
+    "yaw": (2, "mounting_yaw_pitch_deg", DEG),
+    "declination": (1, "declination_deg", DEG),
+    "iron_x": (3, "hard_iron_ut", 1.0),
+    "mount_x": (3, "mounting_m", 1.0),
+    "turn_x": (3, "mounting_turn_deg", DEG),
+    "tilt_x": (2, "tilt_deg", DEG),
+    "offset_x": (2, "offset_m", 1.0),
+    "scale": (1, "scale", 1.0),
+    "lapse": (1, "lapse_kpkm", 1e3),
+}
 
 
 def trajectory(problem: Problem, x: Floats, cov: Floats) -> Trajectory:
@@ -109,40 +126,33 @@ def ungated(beyond: dict[str, np.ndarray]) -> list[str]:
 def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrated]:
     """Parameters under their public names: vectors together, units in the name. A clock offset that this estimator has
     not estimated (sd 0) is the one that ``prepare`` found."""
-    names, free = problem.parameters.names, set(problem.parameters.free)
+    parameters = problem.parameters
+    free, prior_sd = set(parameters.free), parameters.sd
     found: dict[str, Calibrated] = dict(problem.calibration)
-    for k, name in enumerate(names):
+    for k, name in enumerate(parameters.names):
         sensor, _, what = name.rpartition(".")
-        estimated = k in free
-        if what == "arm_x":
-            three = slice(k, k + 3)
-            found[f"{sensor}_lever_arm_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
-        elif what == "clock_offset" and (sd[k] > 0 or f"{sensor}_clock_offset_s" not in found):
-            found[f"{sensor}_clock_offset_s"] = Calibrated(c[k] + problem.clock_offset_s[sensor], sd[k], estimated)
-        elif what == "yaw":
-            degrees = np.rad2deg(c[k : k + 2]), np.rad2deg(sd[k : k + 2])
-            found[f"{sensor}_mounting_yaw_pitch_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
-        elif what == "declination":
-            found[f"{sensor}_declination_deg"] = Calibrated(np.rad2deg(c[k]), np.rad2deg(sd[k]), estimated)
+        if what not in PUBLIC:
+            continue
+        count, public, unit = PUBLIC[what]
+        part, value = slice(k, k + count), c[k : k + count]
+        if what == "clock_offset":
+            if sd[k] == 0.0 and f"{sensor}_{public}" in found:
+                continue
+            value = value + problem.clock_offset_s[sensor]
         elif what == "iron_x":
-            three = slice(k, k + 3)
-            value = problem.rig.sensors[sensor].hard_iron_ut + c[three]
-            found[f"{sensor}_hard_iron_ut"] = Calibrated(tuple(value), tuple(sd[three]), estimated)
-        elif what == "mount_x":
-            three, turn = slice(k, k + 3), slice(k + 3, k + 6)
-            found[f"{sensor}_mounting_m"] = Calibrated(tuple(c[three]), tuple(sd[three]), estimated)
-            degrees = np.rad2deg(c[turn]), np.rad2deg(sd[turn])
-            found[f"{sensor}_mounting_turn_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), k + 3 in free)
-        elif what == "tilt_x":
-            degrees = np.rad2deg(c[k : k + 2]), np.rad2deg(sd[k : k + 2])
-            found[f"{sensor}_tilt_deg"] = Calibrated(tuple(degrees[0]), tuple(degrees[1]), estimated)
-        elif what == "offset_x":
-            found[f"{sensor}_offset_m"] = Calibrated(tuple(c[k : k + 2]), tuple(sd[k : k + 2]), estimated)
-        elif what == "scale":
-            found[f"{sensor}_scale"] = Calibrated(c[k], sd[k], estimated)
-        elif what == "lapse":
-            found[f"{sensor}_lapse_kpkm"] = Calibrated(1e3 * c[k], 1e3 * sd[k], estimated)
+            value = value + problem.rig.sensors[sensor].hard_iron_ut
+        estimated = k in free
+        observed = diagnosis.observed(sd[part], prior_sd[part]) if estimated else None
+        found[f"{sensor}_{public}"] = Calibrated(
+            _shaped(unit * value), _shaped(unit * sd[part]), estimated, None if observed is None else _shaped(observed)
+        )
     return found
+
+
+def _shaped(values: np.ndarray) -> Any:
+    """A number where there is one, else a tuple."""
+    plain = values.tolist()
+    return plain[0] if len(plain) == 1 else tuple(plain)
 
 
 def _drifts(problem: Problem, x: Floats, cov: Floats) -> dict[str, Calibrated]:

@@ -72,11 +72,13 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """A calibration value (float or tuple), its standard deviation, and whether the log estimated it."""
+    """A calibration value (float or tuple), its standard deviation, whether the log estimated it, and whether it is
+    observable on the log: told by it beyond the prior; None where that is not asked."""
 
     value: float | tuple[float, ...]
     sd: float | tuple[float, ...]
     estimated: bool
+    observed: bool | tuple[bool, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

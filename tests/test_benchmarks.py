@@ -57,6 +57,7 @@ def test_consistent_draws_pass_and_their_shares_are_gaussian():
     assert rows["nees_position"].mean == pytest.approx(1.0, abs=0.07)
     assert rows["z_scale"].mean == pytest.approx(0.0, abs=0.15)
     assert rows["z_scale"].sd == pytest.approx(1.0, abs=0.11)
+    assert rows["calibrations_within_3sd"].mean == pytest.approx(99.73, abs=0.8), "400 draws: 0.26 % sd"
     assert rows["position"].mean == pytest.approx(2.5)
     assert rows["position"].bound == (None, 5.0)
     assert rows["failed"].mean == 0

@@ -148,6 +148,8 @@ def test_calibrations_have_their_names_and_units():
     }  # fmt: skip
     for name in estimated:
         assert np.all(np.array(found[name].sd) > 0), name
+        assert np.shape(found[name].observed) == np.shape(found[name].sd), name
+    assert found["magnetometer_declination_deg"].observed is None
     assert found["magnetometer_declination_deg"].value == pytest.approx(2.0)
     assert found["magnetometer_declination_deg"].sd == 0
     assert found["noise_factor"].value == pytest.approx(1.0)
@@ -164,6 +166,7 @@ def test_clock_offset_is_the_whole_one_with_its_sd(estimator):
     offset = result.calibration["prism_clock_offset_s"]
     assert offset.estimated
     assert 0 < offset.sd < 2e-3
+    assert offset.observed
     assert offset.value == pytest.approx(simulation.drawn["prism"]["clock_offset_s"], abs=5 * offset.sd)
     assert abs(simulation.drawn["prism"]["clock_offset_s"]) > 5 * offset.sd, "not zero"
 
@@ -194,6 +197,8 @@ def test_what_the_log_did_not_say_is_said():
     standing = [series.select(series.t_ns < series.t_ns[0] + NS) for series in simulation.log_series]
     result = estimate("batch", prepare(log_of(standing), simulation.rig))
     assert any("prism.arm_x is not observable" in line for line in result.warnings)
+    assert result.calibration["prism_lever_arm_m"].observed == (False, False, False)
+    assert result.calibration["odometer_scale"].observed is False
     assert any("odometer.scale is not observable" in line for line in result.warnings)
 
 

@@ -221,6 +221,7 @@ def test_summary_of_a_result():
         "value": [0.1, 0.2, 0.3],
         "sd": [0.01, 0.01, None],
         "estimated": True,
+        "observed": None,
     }
     assert summary["sensors"]["prism"]["gated"] == 1
     over_time = summary["innovations"]["prism"].pop("over_time")

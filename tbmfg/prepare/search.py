@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tbmfg.diagnosis import observed
 from tbmfg.filters import ins
 from tbmfg.inertial import alignment
 from tbmfg.inertial.noise import spectral_floor
@@ -39,6 +40,7 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
     scale, sd = (1.0 if auto else float(imu.noise_factor)), 0.0
     names = setup.parameters.names
     unknown = [n for n in offsets if setup.parameters.sd[names.index(f"{n}.clock_offset")] > 0]
+    prior_sd = {name: setup.parameters.sd[names.index(f"{name}.clock_offset")] for name in unknown}
     for name in unknown:
         offsets[name] = _coarse_offset(setup, name)
     noisy = [name for name in setup.samples if setup.rig.sensors[name].noise_factor == "auto"]
@@ -62,7 +64,9 @@ def find(setup: Setup, offsets: dict[str, float], tell: Callable[[str, float], N
         problem.calibration[key] = Calibrated(float(value), float(value * sd / scale), auto)
     problem.calibration |= {f"{name}_noise_factor": factor for name, factor in found.items()}
     for name in unknown:
-        problem.calibration[f"{name}_clock_offset_s"] = Calibrated(offsets[name], offset_sd[name], True)
+        problem.calibration[f"{name}_clock_offset_s"] = Calibrated(
+            offsets[name], offset_sd[name], True, bool(observed(offset_sd[name], prior_sd[name]))
+        )
     return problem
 
 
