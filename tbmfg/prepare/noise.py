@@ -21,6 +21,7 @@ from tbmfg.timeseries import Floats
 
 PRIOR_SD = 4.0 * np.log(2.0)  # of u, about the rig's own: a factor of 4
 MOST = 10  # iterations
+LEAST = 1e-4  # squared residual: a sensor without noise leaves none
 SETTLED = 0.01  # of u
 LEAP = 1.5  # of u in one iteration
 
@@ -34,9 +35,9 @@ def factors(problem: Problem, names: list[str]) -> dict[str, Calibrated]:
     filtered = ins.run(problem)
     smoothed = batch.solve(problem, filtered.x, filtered.c)
     x, c = smoothed.x, smoothed.c
-    own = {rows.sensor: rows for rows in problem.rows if rows.sensor in names}
+    own = {rows.sensor: rows for rows in problem.rows if rows.sensor in names and len(rows)}
     # the median does not mind outliers, and so tells which rows are none to begin with
-    u = {name: float(np.log(np.median(smoothed.nis[name]) / chi2.ppf(0.5, rows.dof))) for name, rows in own.items()}
+    u = {name: float(np.log(max(np.median(smoothed.nis[name]), LEAST) / chi2.ppf(0.5, own[name].dof))) for name in own}
     sd = dict.fromkeys(own, PRIOR_SD)
     for _ in range(MOST):
         scaled = [_scaled(rows, u.get(rows.sensor, 0.0)) for rows in problem.rows]
