@@ -71,8 +71,9 @@ def test_without_positions_smoothing_is_not_worse_than_dead_reckoning():
     and a solver that stops before it is straight again is off by ten times as much."""
     source = data("").parent / "husky_odom_imu_gps" / "husky.npz"
     share = {(row.estimator, row.metric): row.mean for row in reckoning.one_drive("husky", source, ["batch"], [])}
+    reference = 100.0 * 0.9 / 359.0  # % of the way: the fixes' own sd
     for metric in ("end", "rms"):
-        assert share["batch", metric] < 1.05 * share["dead reckoning", metric]
+        assert share["batch", metric] < share["dead reckoning", metric] + reference
         assert 0.1 < share["dead reckoning", metric] < 5.0
 
 

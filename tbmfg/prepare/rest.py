@@ -31,7 +31,7 @@ NONE = Rest([], 0.0, 0.0)
 
 def find(rig: Rig, samples: dict[str, Samples], steps: Steps, still: list[tuple[float, float]]) -> Rest:
     """Rest in those of the inertially ``still`` stretches that nothing contradicts."""
-    confirmed = _confirmed(rig, samples, _unturning(steps, still))
+    confirmed = _confirmed(rig, samples, steps, _unturning(steps, still))
     return Rest(confirmed, *(_vibration(steps, signal, confirmed) for signal in (steps.acc, steps.gyro)))
 
 
@@ -41,7 +41,7 @@ def sure(
     """Stretches in which a machine may be taken to feel the Earth's rate alone: confirmed rest, or all ``still`` ones
     where no sensor could confirm it. On an uneven floor slow driving looks still and turns a hundred times faster."""
     able = any(isinstance(rig.sensors[name], PositionSensor | Odometer) for name in samples)
-    return _confirmed(rig, samples, _unturning(steps, still)) if able else still
+    return _confirmed(rig, samples, steps, _unturning(steps, still)) if able else still
 
 
 def _unturning(steps: Steps, still: list[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -54,10 +54,17 @@ def _unturning(steps: Steps, still: list[tuple[float, float]]) -> list[tuple[flo
     return [s for s, rate in zip(still, rates, strict=True) if np.linalg.norm(rate - usual) < TURNING]
 
 
-def _confirmed(rig: Rig, samples: dict[str, Samples], still: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands."""
+def _confirmed(
+    rig: Rig, samples: dict[str, Samples], steps: Steps, still: list[tuple[float, float]]
+) -> list[tuple[float, float]]:
+    """Still stretches, cut to the time in which a position sensor or an odometer says that the machine stands.
+
+    Within the block next to a motion it may have begun, at centimetres a second, without changing the block's mean by
+    what is taken for noise: such a block is left out.
+    """
     confirmed = []
     for start, end in still:
+        opens, closes = steps.edges_s[0], steps.end_s - alignment.BLOCK_S  # blocks are whole: the last may be cut off
         for name, s in samples.items():
             sensor = rig.sensors[name]
             t = s.t_s - getattr(sensor, "clock_offset", 0.0)
@@ -74,7 +81,8 @@ def _confirmed(rig: Rig, samples: dict[str, Samples], still: list[tuple[float, f
                 continue
             # the stamps' offset may be unknown: leave its spread free on either side
             margin = 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
-            first, last = float(t[rows][0]) + margin, float(t[rows][-1]) - margin
+            first = float(t[rows][0]) + max(margin, alignment.BLOCK_S * (start > opens))
+            last = float(t[rows][-1]) - max(margin, alignment.BLOCK_S * (end < closes))
             if resting and last > first:
                 confirmed.append((first, last))
             break
@@ -92,7 +100,7 @@ def _vibration(steps: Steps, signal: Floats, intervals: list[tuple[float, float]
             continue
         v = np.cumsum((part - part.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
         # drift of the mean over a second is no vibration
-        size = max(1, round(1.0 / steps.period_s))
+        size = max(1, min(round(1.0 / steps.period_s), len(part)))
         smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
         squares.append(np.mean((v - smooth)[size:-size] ** 2) if len(v) > 3 * size else np.mean((v - smooth) ** 2))
     return float(np.sqrt(np.mean(squares))) if squares else 0.0
