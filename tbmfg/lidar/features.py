@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 
 from tbmfg.geometry import skew
-from tbmfg.lidar.registration import FEW, TILT_SD
-from tbmfg.lidar.surfels import EMPTY, SurfelMap, find, key_of
+from tbmfg.lidar.surfels import EMPTY, FEW, TILT_SD, SurfelMap, find, key_of
 from tbmfg.timeseries import Floats
 
 Test = Literal["shape", "printed"]
