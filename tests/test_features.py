@@ -27,7 +27,7 @@ def room(rng):
 
 def mapped(points, voxel=0.5):
     table = SurfelMap(voxel, full=np.inf)
-    table.add(points)
+    table.add(points, np.zeros(3))
     return table
 
 

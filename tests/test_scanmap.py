@@ -47,7 +47,7 @@ def room(rng, count, share=1.0, half=(4.25, 2.75, 2.25)):
 @cache
 def known_map():
     table = SurfelMap(0.5, full=np.inf)
-    table.add(room(np.random.default_rng(0), 20_000))
+    table.add(room(np.random.default_rng(0), 20_000), np.zeros(3))
     return table
 
 
@@ -167,7 +167,7 @@ def test_what_the_walls_do_not_tell_is_left_to_the_prior():
     rng = np.random.default_rng(2)
     points = np.concatenate([wall(axis, side * 2.0, rng, size=6.0) for axis in (1, 2) for side in (-1, 1)])
     table = SurfelMap(0.5)
-    table.add(points)
+    table.add(points, np.zeros(3))
     scan = Swept(0, 1, features.thinned(points[rng.permutation(len(points))], 0.5) - [0.3, 0.02, 0.01], None)
     P = prior()
     P[:6, :6] = np.diag(np.repeat([0.001, 0.05], 3) ** 2)

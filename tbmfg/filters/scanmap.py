@@ -177,7 +177,7 @@ class ScanMap:
         self.nis.append(float(nis))
         R, p, _ = relative(x, self.pose, dx)
         self.pose = moved(self.pose, dx[-CLONE:])
-        self.map.add(points @ R.T + p)
+        self.map.add(points @ R.T + p, R @ self.scans.sensor.T_bl.xyz + p)
         if len(self.edges) % FORGET_EVERY == 0:
             self.map.keep_near(p, self.scans.sensor.max_range)
         return dx, P1
@@ -185,7 +185,7 @@ class ScanMap:
     def _begin(self, points: Floats, x: Floats, P: Floats) -> Floats:
         """A new map from one scan, in the body's axes; the covariance with the map's pose as a clone of the body's."""
         self.map, self.pose = SurfelMap(self.scans.sensor.voxel), x.copy()
-        self.map.add(points)
+        self.map.add(points, self.scans.sensor.T_bl.xyz)
         self.begun, self.lost = self.begun + 1, 0
         P = P.copy()
         P[-CLONE:] = P[:CLONE]
