@@ -434,7 +434,7 @@ def test_results_that_are_no_numbers_are_refused(monkeypatch):
     result = SimpleNamespace(estimator="batch", trajectory=Path(**good), smoothed=bad, counts={}, warnings=[])
     entry = SimpleNamespace(run=lambda problem, progress: result, needs=())
     monkeypatch.setitem(estimators.ESTIMATORS, "batch", entry)
-    problem = SimpleNamespace(keyframes_s=np.arange(n) * 2.0, samples={})
+    problem = SimpleNamespace(keyframes_s=np.arange(n) * 2.0, samples={}, scans={})
     with pytest.raises(EstimationError, match=r"batch lost the state at 6\.0 s: it is not finite"):
         estimators.estimate("batch", problem)
     result.smoothed = None

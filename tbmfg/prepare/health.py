@@ -41,8 +41,9 @@ def check(sensor: Sensor, samples: Samples) -> Sound:
 
 
 def odometer(t_s: Floats, speed: Floats, sigma: float) -> Sound:
-    """Leaves out speeds (n,) that jump, and those of an encoder that hangs on one; it may read zero for long."""
-    hung, said = hangs(t_s, speed, speed == 0.0)
+    """Leaves out speeds (n,) that jump, and those of an encoder that hangs on one. What cannot be told from zero may
+    repeat for long: the machine stands."""
+    hung, said = hangs(t_s, speed, np.abs(speed) < sigma)
     moving, jumps = _jumps(t_s, speed, sigma)
     return ~hung & moving, [*said, *jumps]
 
