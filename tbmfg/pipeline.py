@@ -432,9 +432,13 @@ def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Cali
 
 def peak_rss_mb() -> float | None:
     """Largest memory of this process so far, in 10^6 bytes; None where the system does not say."""
+    try:  # Linux hands ru_maxrss on from whoever started the process; its high-water mark is the process's own
+        status = Path("/proc/self/status").read_text("ascii")
+        return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM:")) * 1024 / 1e6
+    except (OSError, StopIteration):
+        pass
     try:
         import resource
     except ImportError:  # Windows
         return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak * (1 if sys.platform == "darwin" else 1024) / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
