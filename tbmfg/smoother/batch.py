@@ -16,7 +16,7 @@ from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
 from tbmfg.smoother.graph import States
 from tbmfg.timeseries import Floats
 
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 100  # by weights of outliers that follow the state it converges linearly
 STAGE_ITERATIONS = 2  # at each loss on the way to the truncated square
 OFFSET_REACH_S = 0.02  # a clock offset beyond the one found by ``prepare``: the prism's model is first order in it
 # a step that does not pay is tried along the path, which reaches farther where nothing holds the heading, and shorter
