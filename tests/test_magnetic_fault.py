@@ -52,7 +52,8 @@ def test_huber_would_have_followed_it(offset):
     simulation, problem = offset
     rows = [replace(r, loss="huber") if r.model == "magnetometer" else r for r in problem.rows]
     result = estimate("batch", replace(problem, rows=rows))
-    assert np.abs(yaw_errors_deg(simulation, problem, result.trajectory)).max() > 5.0
+    # at least by a fifth of the 20 degrees of the fault
+    assert np.abs(yaw_errors_deg(simulation, problem, result.trajectory)).max() > 20.0 / 5.0
 
 
 def test_slow_field_is_found_once_it_passes_three_sigma():
