@@ -100,7 +100,7 @@ def run(
     predicted = Prediction(problem, switches.tau_s)
     nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
-    in_a_row = dict.fromkeys(nis, 0)
+    in_a_row, gates = dict.fromkeys(nis, 0), {rows.sensor: chi2.ppf(GATE, rows.dof) for rows in problem.rows}
     epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows] or [keyframes]))
     due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
     for rows in problem.rows:
@@ -122,7 +122,7 @@ def run(
             residual, H = linearise(rows, r, x, c, free, len(P))
             nis[rows.sensor][r] = innovation(P, H, residual)[0]
             in_a_row[rows.sensor] += 1
-            if nis[rows.sensor][r] > chi2.ppf(GATE, rows.dof):
+            if nis[rows.sensor][r] > gates[rows.sensor]:
                 if scans is None or in_a_row[rows.sensor] <= REOPEN:
                     gated[rows.sensor][r] = True
                     continue
