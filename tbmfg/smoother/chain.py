@@ -107,40 +107,44 @@ def _triangularise(W: np.ndarray, rows: int, columns: int) -> None:
 
 
 @njit(cache=True)
+def pass_on(W, carry, unary, binary, d, m):
+    """Eliminate one keyframe that another follows: what the past says of it, ``carry`` (d + m, d + m + 1) on [x, c, b],
+    and its rows. Leaves its conditional in W[:d], what is passed on to the next in W[d : 2 d + m, d:]."""
+    rows = d + m
+    W[:, :] = 0.0
+    W[:rows, :d], W[:rows, 2 * d :] = carry[:, :d], carry[:, d:]
+    for u in range(len(unary)):
+        W[rows, :d], W[rows, 2 * d :] = unary[u, :d], unary[u, d:]
+        rows += 1
+    for b in range(len(binary)):
+        W[rows] = binary[b]
+        rows += 1
+    _triangularise(W, rows, 2 * d + m)
+
+
+@njit(cache=True)
+def end(conditional, carry, unary, d, m):
+    """Eliminate the last keyframe into ``conditional``: the triangle [R_c, rhs] (m, m + 1) of c."""
+    last = np.zeros((d + m + len(unary), d + m + 1))
+    last[: d + m], last[d + m :] = carry, unary
+    _triangularise(last, len(last), d + m)
+    conditional[:, :d], conditional[:, 2 * d :] = last[:d, :d], last[:d, d:]
+    return last[d : d + m, d:].copy()
+
+
+@njit(cache=True)
 def _eliminate(U, u_start, B, b_start, n, d, m):
     """Conditionals [R_k, S_next, S_c, rhs] (n, d, 2 d + m + 1), and the triangle [R_c, rhs] (m, m + 1) of c."""
-    width = 2 * d + m + 1
-    out = np.zeros((n, d, width))
+    out = np.zeros((n, d, 2 * d + m + 1))
     carry = np.zeros((d + m, d + m + 1))  # what the past says about [x_k, c]
     most = 0
     for k in range(n):
         most = max(most, u_start[k + 1] - u_start[k] + b_start[k + 1] - b_start[k])
-    W = np.empty((2 * (d + m) + most, width))
+    W = np.empty((2 * (d + m) + most, 2 * d + m + 1))
     for k in range(n - 1):
-        rows = d + m
-        W[:, :] = 0.0
-        W[:rows, :d] = carry[:, :d]
-        W[:rows, 2 * d :] = carry[:, d:]
-        for u in range(u_start[k], u_start[k + 1]):
-            W[rows, :d] = U[u, :d]
-            W[rows, 2 * d :] = U[u, d:]
-            rows += 1
-        for b in range(b_start[k], b_start[k + 1]):
-            W[rows] = B[b]
-            rows += 1
-        _triangularise(W, rows, width - 1)
-        out[k] = W[:d]
-        carry[:, :] = W[d : 2 * d + m, d:]
-    last = np.zeros((d + m + most, d + m + 1))
-    last[: d + m] = carry
-    rows = d + m
-    for u in range(u_start[n - 1], u_start[n]):
-        last[rows] = U[u]
-        rows += 1
-    _triangularise(last, rows, d + m)
-    out[n - 1, :, :d] = last[:d, :d]
-    out[n - 1, :, 2 * d :] = last[:d, d:]
-    return out, last[d : d + m, d:].copy()
+        pass_on(W, carry, U[u_start[k] : u_start[k + 1]], B[b_start[k] : b_start[k + 1]], d, m)
+        out[k], carry[:, :] = W[:d], W[d : 2 * d + m, d:]
+    return out, end(out[n - 1], carry, U[u_start[n - 1] : u_start[n]], d, m)
 
 
 @njit(cache=True)
@@ -262,20 +266,6 @@ def eliminate(blocks: list[Block], n: int, d: int, m: int) -> Elimination:
 def newest(blocks: list[Block], n: int, d: int, m: int) -> Floats:
     """Covariance of each of n keyframes when it was the newest, by the rows that end at it or before, (n, d, d)."""
     return _newest(*assemble(blocks, n, d, m), n, d, m)
-
-
-def marginal(blocks: list[Block], n: int, d: int, m: int) -> Block:
-    """What the keyframes before the last of n leave on that and the constants, as rows on the latter (its keyframe 0),
-    from all rows on them; those on the last alone are left where they are."""
-    on_others = [blk for blk in blocks if blk.A_j is not None] + [
-        Block(blk.i[own], blk.A_i[own], None, blk.A_c[own], blk.b[own])
-        for blk in blocks
-        if blk.A_j is None and (own := blk.i < n - 1).any()
-    ]
-    conditionals, border = _eliminate(*assemble(on_others, n, d, m), n, d, m)
-    rows = np.zeros((d + m, d + m + 1))
-    rows[:d, :d], rows[:d, d:], rows[d:, d:] = conditionals[-1, :, :d], conditionals[-1, :, 2 * d :], border
-    return Block(np.zeros(1, dtype=int), rows[None, :, :d], None, rows[None, :, d:-1], rows[None, :, -1])
 
 
 def lengths(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, Floats]:

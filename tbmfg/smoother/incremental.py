@@ -65,8 +65,7 @@ def run(problem: Problem, progress: Callable[[float], None] | None = None) -> On
     out.c = _constants(isam, factors)
     for k in range(oldest, n):
         out.last_x[k] = read_state(values, k, e)
-    for k in range(n):
-        out.residuals(problem, k, out.c)
+    out.residuals(problem, slice(0, n), out.c)
     for sensor in range(len(problem.rows)):
         key, which = factors.constant_key(sensor), factors.constant_parameters(sensor)
         if key in factors.known:

@@ -37,10 +37,10 @@ class Online:
             problem.parameters.start.copy(), np.zeros((m, m)), nis,
         )  # fmt: skip
 
-    def residuals(self, problem: Problem, k: int, c: Floats) -> None:
-        """Squared normalised residuals of keyframe k's rows at the last estimates, in place."""
+    def residuals(self, problem: Problem, keyframes: slice, c: Floats) -> None:
+        """Squared normalised residuals of the keyframes' rows at the last estimates, in place."""
         for rows in problem.rows:
-            own = slice(*np.searchsorted(rows.j, [k, k + 1]))
+            own = slice(*np.searchsorted(rows.j, [keyframes.start, keyframes.stop]))
             if own.start < own.stop:
                 r = rows.evaluate_at(self.last_x[rows.i[own]], self.last_x[rows.j[own]], c, own)[0]
                 self.nis[rows.sensor][own] = np.sum(r**2, axis=1)
