@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_closing, median_filter
-from scipy.stats import chi2, poisson
 
+from tbmfg.chance import chi_square_beyond, poisson_at_least
 from tbmfg.problem import GATE, Problem
 from tbmfg.rig import kind_of
 from tbmfg.state import ROT, Innovations, Interval, Trajectory
@@ -147,8 +147,8 @@ def gated_in_words(innovations: dict[str, Innovations], stretches: list[Interval
     for sensor, series in innovations.items():
         gated, nis, t = series.gated, np.nan_to_num(series.nis), (series.t_ns - origin_ns) * 1e-9
         expected = (1.0 - GATE) * len(gated)
-        rare = poisson.sf(gated.sum() - 1, expected) < CHANCE
-        if not gated.any() or not (rare or len(nis) * chi2.sf(nis[gated].max(), series.dof) < CHANCE):
+        rare = poisson_at_least(gated.sum(), expected) < CHANCE
+        if not gated.any() or not (rare or len(nis) * chi_square_beyond(nis[gated].max(), series.dof) < CHANCE):
             continue
         farthest = np.flatnonzero(gated)[np.argmax(nis[gated])]
         line = (

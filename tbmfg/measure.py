@@ -56,8 +56,9 @@ def keyframe_edges(rule: Keyframes, edges_s: Floats, end_s: float, fixes_s: Floa
     if kept[-1] != last:
         kept.append(last)
     parts = np.maximum(np.ceil(np.diff(edges_s[kept]) / rule.max_gap_s - 1e-9).astype(int), 1)
-    pieces = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(kept[:-1], kept[1:], parts, strict=True)]
-    return np.unique(np.concatenate([*pieces, [last]]).astype(int))
+    number = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    between = np.repeat(kept[:-1], parts) + number * np.repeat(np.diff(kept) / parts, parts)
+    return np.unique(np.append(between, last).astype(int))
 
 
 def nearest(keyframes_s: Floats, t_s: Floats) -> np.ndarray:

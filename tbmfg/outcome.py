@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from tbmfg import diagnosis
+from tbmfg.chance import chi_square_point
 from tbmfg.geometry import quat_from_matrix
 from tbmfg.problem import GATE, Problem
 from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
@@ -110,7 +110,7 @@ def of_samples(problem: Problem, estimator: str, x: Floats, cov: Floats | None, 
 
 def beyond_gate(problem: Problem, nis: dict[str, Floats]) -> dict[str, np.ndarray]:
     """Which rows lie beyond the gate, by sensor."""
-    return {rows.sensor: nis[rows.sensor] > chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+    return {rows.sensor: nis[rows.sensor] > chi_square_point(GATE, rows.dof) for rows in problem.rows}
 
 
 def ungated(beyond: dict[str, np.ndarray]) -> list[str]:

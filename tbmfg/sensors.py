@@ -334,6 +334,17 @@ def lidar(z, data, xi, xj, c):
     return (S @ e[:, :, None])[:, :, 0], S @ Ji, S @ Jj, S @ Jc
 
 
+@njit(cache=True)
+def _whiten(r, Ji, Jj, Jc, sigma):
+    """Divide residuals (n, k) and Jacobians (n, k, .) by ``sigma`` (n, k), in place."""
+    for n in range(r.shape[0]):
+        for k in range(r.shape[1]):
+            r[n, k] /= sigma[n, k]
+            Ji[n, k] /= sigma[n, k]
+            Jj[n, k] /= sigma[n, k]
+            Jc[n, k] /= sigma[n, k]
+
+
 MODELS: dict[str, Callable] = {
     f.__name__: f
     for f in (prism, odometer, wheel, magnetometer, barometer, laser, position, velocity, rotation, bounded, lidar)
@@ -383,9 +394,6 @@ class Rows:
         self, xi: Floats, xj: Floats, c: Floats, rows: slice = slice(None)
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """The same for the given rows, whose states are given one by one."""
-        sigma = self.sigma[rows]
-        r, Ji, Jj, Jc = MODELS[self.model](self.z[rows], self.data[rows], xi, xj, c[self.calib])
-        r /= sigma
-        for J in (Ji, Jj, Jc):
-            J /= sigma[:, :, None]
-        return r, Ji, Jj, Jc
+        parts = MODELS[self.model](self.z[rows], self.data[rows], xi, xj, c[self.calib])
+        _whiten(*parts, self.sigma[rows])
+        return parts

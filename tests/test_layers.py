@@ -14,7 +14,7 @@ LEVELS = (
     ("errors",),
     ("registry",),
     ("timeseries", "yamltext", "storage", "workers"),
-    ("geometry", "earth", "fields"),
+    ("geometry", "earth", "fields", "chance"),
     ("state", "rig"),
     ("sensors", "mcap", "inertial", "lidar", "evaluation"),
     ("measure", "gnss", "results", "comparison"),
@@ -32,7 +32,7 @@ LEVELS = (
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}
 
 # Narrower than the levels allow: what is measured with, and what is measured, stay apart.
-ONLY = {"evaluation": {"errors", "timeseries", "geometry", "state"}}
+ONLY = {"evaluation": {"errors", "timeseries", "geometry", "chance", "state"}}
 
 # The simulators share the vocabulary of tbmfg and none of the equations that they put to the test.
 DATASETS_SEE = {"errors", "timeseries", "yamltext", "geometry", "earth", "state", "rig", "mcap"}

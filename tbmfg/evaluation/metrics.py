@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import gammaincinv
 
+from tbmfg.chance import chi_square_point
 from tbmfg.evaluation.correlation import effective_samples
 from tbmfg.geometry import skew, split_yaw_tilt
 from tbmfg.state import POS, ROT, VEL, Trajectory, Truth
@@ -221,7 +221,7 @@ def chi_square_bounds(n: float, dof: int, alpha: float = 0.01) -> tuple[float, f
 
     Bar-Shalom, Li, Kirubarajan (2001) sec. 5.4.2. ``n`` may be fractional: an effective number of samples.
     """
-    low, high = 2.0 * gammaincinv(n * dof / 2.0, [alpha / 2.0, 1.0 - alpha / 2.0]) / n
+    low, high = chi_square_point(np.array([alpha / 2.0, 1.0 - alpha / 2.0]), n * dof) / n
     return float(low), float(high)
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.stats import chi2
 
+from tbmfg.chance import chi_square_point
 from tbmfg.filters.kalman import correct, innovation, predict
 from tbmfg.inertial.strapdown import correct_state, difference, propagate
 from tbmfg.problem import GATE, Problem
@@ -76,7 +76,7 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
     places = np.full(len(c), -1)
     places[free] = np.arange(m)
     starts = {rows.sensor: np.searchsorted(rows.j, np.arange(n + 1)) for rows in problem.rows}
-    gates = {rows.sensor: chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+    gates = {rows.sensor: chi_square_point(GATE, rows.dof) for rows in problem.rows}
     # where among the free calibrations, or nowhere, those of a sensor are
     inputs = {rows.sensor: places[rows.calib] for rows in problem.rows}
     cost = 0.0

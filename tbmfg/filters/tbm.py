@@ -2,9 +2,9 @@
 
 Numbers in brackets are the paper's equations, E its errata; the corrected form is meant throughout. The paper's error
 is computed minus true with C_computed = exp(-[phi]x) C_true, z down; here it is that of ``inertial.strapdown``, true =
-estimate (+) error with a rotation d in b, z up: phi = R d, all else changes sign. So (9)-(12) are ``mechanise_step``
-on increments with (8) and the coning and sculling of (11), (19)-(21) with E11-E13 are ``propagate``, (22) with E14 and
-E15 is ``sensors.prism``, (25) is ``kalman.correct`` and (26) with E17 ``correct_state``.
+estimate (+) error with a rotation d in b, z up: phi = R d, all else changes sign. So (9)-(12), on increments with (8)
+and the coning and sculling of (11), and (19)-(21) with E11-E13 are ``strapdown.propagate``, (22) with E14 and E15 is
+``sensors.prism``, (25) is ``kalman.correct`` and (26) with E17 ``correct_state``.
 
 Every fix is taken when it comes, at the IMU edge nearest to it and carried from there by the velocity. Nothing else is
 used: no zero velocity, no other sensor. A prior of the heading is needed, for a slow machine's prism hardly tells it.
@@ -19,8 +19,8 @@ from typing import Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
 
+from tbmfg.chance import chi_square_point
 from tbmfg.fields import Node, Positive
 from tbmfg.filters.kalman import correct, innovation, predict
 from tbmfg.filters.scanmap import CLONE, ScanMap
@@ -100,7 +100,7 @@ def run(
     predicted = Prediction(problem, switches.tau_s)
     nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
-    in_a_row, gates = dict.fromkeys(nis, 0), {rows.sensor: chi2.ppf(GATE, rows.dof) for rows in problem.rows}
+    in_a_row, gates = dict.fromkeys(nis, 0), {rows.sensor: chi_square_point(GATE, rows.dof) for rows in problem.rows}
     epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows] or [keyframes]))
     due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
     for rows in problem.rows:

@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from scipy.signal import fftconvolve
 
 from tbmfg.fields import DEG, MICRO_G
 from tbmfg.inertial.steps import Steps
@@ -104,6 +103,8 @@ def smooth(x: Floats, rule: Rule, size: int) -> Floats:
 
 def running_mean(x: Floats, size: int) -> Floats:
     """Mean of x (n, k) about each sample under a Hann window of ``size`` samples, shorter at the ends."""
+    from scipy.signal import fftconvolve  # half a second to import
+
     window = hann(size)[:, None]
     return fftconvolve(x, window, "same", axes=0) / fftconvolve(np.ones((len(x), 1)), window, "same", axes=0)
 

@@ -16,22 +16,27 @@ STATE = 21
 
 @njit(cache=True)
 def exp_rotation(w: np.ndarray) -> np.ndarray:
-    """Exp of one rotation vector (3,) -> (3, 3); Rodrigues, series below 1e-4 rad."""
-    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    """Exp of one rotation vector (3,) -> (3, 3)."""
+    out = np.empty((3, 3))
+    _exp(out, w[0], w[1], w[2])
+    return out
+
+
+@njit(cache=True)
+def _exp(out, x, y, z):
+    """Exp of a rotation vector into ``out`` (3, 3); Rodrigues, series below 1e-4 rad."""
+    angle2 = x * x + y * y + z * z
     if angle2 < 1e-8:
         a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     else:
         angle = np.sqrt(angle2)
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    x, y, z = w[0], w[1], w[2]
-    out = np.empty((3, 3))
     out[0, 0] = 1.0 - b * (y * y + z * z)
     out[1, 1] = 1.0 - b * (x * x + z * z)
     out[2, 2] = 1.0 - b * (x * x + y * y)
     out[0, 1], out[1, 0] = b * x * y - a * z, b * x * y + a * z
     out[0, 2], out[2, 0] = b * x * z + a * y, b * x * z - a * y
     out[1, 2], out[2, 1] = b * y * z - a * x, b * y * z + a * x
-    return out
 
 
 @njit(cache=True)
@@ -48,42 +53,33 @@ def _mul(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _apply(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return np.array(
-        [
-            A[0, 0] * x[0] + A[0, 1] * x[1] + A[0, 2] * x[2],
-            A[1, 0] * x[0] + A[1, 1] * x[1] + A[1, 2] * x[2],
-            A[2, 0] * x[0] + A[2, 1] * x[1] + A[2, 2] * x[2],
-        ]
-    )
-
-
-@njit(cache=True)
-def _mul_skew(A: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """A [v]x, (3, 3)."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        out[i, 0] = A[i, 1] * v[2] - A[i, 2] * v[1]
-        out[i, 1] = A[i, 2] * v[0] - A[i, 0] * v[2]
-        out[i, 2] = A[i, 0] * v[1] - A[i, 1] * v[0]
-    return out
-
-
-@njit(cache=True)
-def mechanise_step(R, p, v, rate, force, dt, earth_n, gravity_n):
-    """One step with compensated rate and force (biases removed); returns R, p, v at its end.
+def _step(R, p, v, back, force, dt, earth_n, gravity_n, work):
+    """One step with compensated rate and force (biases removed), ``back`` being Exp(-rate dt): R, p, v in place.
 
     R' = Exp(-w_ie dt) R Exp(rate dt); v' = v + (Exp(-w_ie dt / 2) R f + g - 2 w_ie x v) dt; p' = p + (v + v') dt / 2:
     tbm_mse (9), (11), (12) with z up. ``force`` is resolved in b at the step's start, n turns on by half a step.
+    ``work`` (2, 3, 3) is scratch: a step is too short to ask for memory.
     """
-    a = _apply(_mul(exp_rotation(-0.5 * dt * earth_n), R), force)
-    ax = a[0] + gravity_n[0] - 2.0 * (earth_n[1] * v[2] - earth_n[2] * v[1])
-    ay = a[1] + gravity_n[1] - 2.0 * (earth_n[2] * v[0] - earth_n[0] * v[2])
-    az = a[2] + gravity_n[2] - 2.0 * (earth_n[0] * v[1] - earth_n[1] * v[0])
-    v1 = np.array([v[0] + ax * dt, v[1] + ay * dt, v[2] + az * dt])
-    p1 = p + 0.5 * dt * (v + v1)
-    R1 = _mul(_mul(exp_rotation(-earth_n * dt), R), exp_rotation(rate * dt))
-    return R1, p1, v1
+    turn, turned = work[0], work[1]
+    w0, w1, w2 = earth_n[0], earth_n[1], earth_n[2]
+    v0, v1, v2 = v[0], v[1], v[2]
+    f0 = R[0, 0] * force[0] + R[0, 1] * force[1] + R[0, 2] * force[2]
+    f1 = R[1, 0] * force[0] + R[1, 1] * force[1] + R[1, 2] * force[2]
+    f2 = R[2, 0] * force[0] + R[2, 1] * force[1] + R[2, 2] * force[2]
+    _exp(turn, -0.5 * dt * w0, -0.5 * dt * w1, -0.5 * dt * w2)
+    v[0] += dt * (turn[0, 0] * f0 + turn[0, 1] * f1 + turn[0, 2] * f2 + gravity_n[0] - 2.0 * (w1 * v2 - w2 * v1))
+    v[1] += dt * (turn[1, 0] * f0 + turn[1, 1] * f1 + turn[1, 2] * f2 + gravity_n[1] - 2.0 * (w2 * v0 - w0 * v2))
+    v[2] += dt * (turn[2, 0] * f0 + turn[2, 1] * f1 + turn[2, 2] * f2 + gravity_n[2] - 2.0 * (w0 * v1 - w1 * v0))
+    p[0] += 0.5 * dt * (v0 + v[0])
+    p[1] += 0.5 * dt * (v1 + v[1])
+    p[2] += 0.5 * dt * (v2 + v[2])
+    _exp(turn, -dt * w0, -dt * w1, -dt * w2)
+    for i in range(3):
+        for j in range(3):
+            turned[i, j] = R[i, 0] * back[j, 0] + R[i, 1] * back[j, 1] + R[i, 2] * back[j, 2]
+    for i in range(3):
+        for j in range(3):
+            R[i, j] = turn[i, 0] * turned[0, j] + turn[i, 1] * turned[1, j] + turn[i, 2] * turned[2, j]
 
 
 @njit(cache=True)
@@ -93,9 +89,13 @@ def mechanise(x0, edges, gyro, acc, earth_n, gravity_n):
     out = np.empty((n + 1, STATE))
     out[0] = x0
     R, p, v = x0[:9].copy().reshape(3, 3), x0[9:12].copy(), x0[12:15].copy()
+    back, work, rate, force = np.empty((3, 3)), np.empty((2, 3, 3)), np.empty(3), np.empty(3)
     for k in range(n):
         dt = edges[k + 1] - edges[k]
-        R, p, v = mechanise_step(R, p, v, gyro[k] - x0[18:21], acc[k] - x0[15:18], dt, earth_n, gravity_n)
+        for i in range(3):
+            rate[i], force[i] = gyro[k, i] - x0[18 + i], acc[k, i] - x0[15 + i]
+        _exp(back, -dt * rate[0], -dt * rate[1], -dt * rate[2])
+        _step(R, p, v, back, force, dt, earth_n, gravity_n, work)
         out[k + 1, :9] = R.reshape(9)
         out[k + 1, 9:12] = p
         out[k + 1, 12:15] = v
@@ -112,29 +112,24 @@ def propagate(x0, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_
     d_p' = d_v; Groves (2013) ch. 14 with a right perturbation.
     """
     R, p, v = x0[:9].copy().reshape(3, 3), x0[9:12].copy(), x0[12:15].copy()
-    ba, bg = x0[15:18], x0[18:21]
-    Phi, Q = np.eye(15), np.zeros((15, 15))
+    Phi, Q, Q_other = np.eye(15), np.zeros((15, 15)), np.empty((15, 15))
+    back, work, force, Rf = np.empty((3, 3)), np.empty((2, 3, 3)), np.empty(3), np.empty((3, 3))
     for k in range(first, last):
         dt = edges[k + 1] - edges[k]
-        rate, force = gyro[k] - bg, acc[k] - ba
-        Rf = _mul_skew(R, force)  # R [f]x
-        E = exp_rotation(-rate * dt)
-
-        # F = [[E, 0, 0, 0, -dt], [-Rf dt^2/2, 1, dt, -R dt^2/2, 0], [-Rf dt, 0, 1, -R dt, 0], 1, 1] on both Phi and Q
-        for pass_ in range(3):
-            # pass 0: Phi <- F Phi; passes 1, 2: Q <- F (F Q)^T, Q being symmetric
-            M = Phi if pass_ == 0 else Q
+        for i in range(3):
+            force[i] = acc[k, i] - x0[15 + i]
+        _exp(back, dt * (x0[18] - gyro[k, 0]), dt * (x0[19] - gyro[k, 1]), dt * (x0[20] - gyro[k, 2]))
+        for i in range(3):  # R [f]x
+            Rf[i, 0] = R[i, 1] * force[2] - R[i, 2] * force[1]
+            Rf[i, 1] = R[i, 2] * force[0] - R[i, 0] * force[2]
+            Rf[i, 2] = R[i, 0] * force[1] - R[i, 1] * force[0]
+        _carry(Phi, back, Rf, R, dt)
+        _carry(Q, back, Rf, R, dt)  # F Q F^T = F (F Q)^T, Q being symmetric
+        for i in range(15):
             for j in range(15):
-                th0, th1, th2 = M[0, j], M[1, j], M[2, j]
-                for i in range(3):
-                    fv = Rf[i, 0] * th0 + Rf[i, 1] * th1 + Rf[i, 2] * th2
-                    fa = R[i, 0] * M[9, j] + R[i, 1] * M[10, j] + R[i, 2] * M[11, j]
-                    M[3 + i, j] += dt * M[6 + i, j] - 0.5 * dt * dt * (fv + fa)
-                    M[6 + i, j] -= dt * (fv + fa)
-                for i in range(3):
-                    M[i, j] = E[i, 0] * th0 + E[i, 1] * th1 + E[i, 2] * th2 - dt * M[12 + i, j]
-            if pass_ == 1:
-                Q = Q.T.copy()
+                Q_other[i, j] = Q[j, i]
+        Q, Q_other = Q_other, Q
+        _carry(Q, back, Rf, R, dt)
         ga, aa = psd_gyro[k], psd_acc[k]
         for i in range(3):
             Q[i, i] += ga * dt
@@ -144,12 +139,29 @@ def propagate(x0, first, last, edges, gyro, acc, psd_gyro, psd_acc, psd_bg, psd_
             Q[6 + i, 3 + i] += aa * dt**2 / 2.0
             Q[9 + i, 9 + i] += psd_ba * dt
             Q[12 + i, 12 + i] += psd_bg * dt
-        R, p, v = mechanise_step(R, p, v, rate, force, dt, earth_n, gravity_n)
+        _step(R, p, v, back, force, dt, earth_n, gravity_n, work)
     x1 = x0.copy()
     x1[:9] = R.reshape(9)
     x1[9:12] = p
     x1[12:15] = v
     return x1, Phi, Q
+
+
+@njit(cache=True)
+def _carry(M, back, Rf, R, dt):
+    """M <- F M of one step: F = [[back, 0, 0, 0, -dt], [-Rf dt^2/2, 1, dt, -R dt^2/2, 0], [-Rf dt, 0, 1, -R dt, 0], 1,
+    1]."""
+    half = 0.5 * dt * dt
+    for i in range(3):
+        a0, a1, a2, b0, b1, b2 = Rf[i, 0], Rf[i, 1], Rf[i, 2], R[i, 0], R[i, 1], R[i, 2]
+        for j in range(15):
+            force = a0 * M[0, j] + a1 * M[1, j] + a2 * M[2, j] + b0 * M[9, j] + b1 * M[10, j] + b2 * M[11, j]
+            M[3 + i, j] += dt * M[6 + i, j] - half * force
+            M[6 + i, j] -= dt * force
+    for j in range(15):
+        r0, r1, r2 = M[0, j], M[1, j], M[2, j]
+        for i in range(3):
+            M[i, j] = back[i, 0] * r0 + back[i, 1] * r1 + back[i, 2] * r2 - dt * M[12 + i, j]
 
 
 @njit(cache=True)

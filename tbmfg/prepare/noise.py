@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
 
+from tbmfg.chance import chi_square_below, chi_square_point
 from tbmfg.filters import ins
 from tbmfg.problem import GATE, Problem
 from tbmfg.sensors import Rows
@@ -37,12 +37,13 @@ def factors(problem: Problem, names: list[str]) -> dict[str, Calibrated]:
     x, c = smoothed.x, smoothed.c
     own = {rows.sensor: rows for rows in problem.rows if rows.sensor in names and len(rows)}
     # the median does not mind outliers, and so tells which rows are none to begin with
-    u = {name: float(np.log(max(np.median(smoothed.nis[name]), LEAST) / chi2.ppf(0.5, own[name].dof))) for name in own}
+    median = {name: max(np.median(smoothed.nis[name]), LEAST) / chi_square_point(0.5, own[name].dof) for name in own}
+    u = {name: float(np.log(value)) for name, value in median.items()}
     sd = dict.fromkeys(own, PRIOR_SD)
     for _ in range(MOST):
         scaled = [_scaled(rows, u.get(rows.sensor, 0.0)) for rows in problem.rows]
         nis = {rows.sensor: np.sum(rows.evaluate(x, c)[0] ** 2, axis=1) for rows in scaled}
-        sound = [rows.between(0, len(x) - 1, nis[rows.sensor] > chi2.ppf(GATE, rows.dof)) for rows in scaled]
+        sound = [rows.between(0, len(x) - 1, nis[rows.sensor] > chi_square_point(GATE, rows.dof)) for rows in scaled]
         clean = replace(problem, rows=[replace(rows, loss="none") for rows in sound if len(rows)])
         smoothed = batch.solve(clean, x, c)
         x, c = smoothed.x, smoothed.c
@@ -54,7 +55,8 @@ def factors(problem: Problem, names: list[str]) -> dict[str, Calibrated]:
             which = noisy(rows)
             trace, square = batch.residual_traces(clean, x, c, name, which)
             r = rows.evaluate(x, c)[0][:, which]
-            inside = chi2.cdf(chi2.ppf(GATE, rows.dof), rows.dof + 2) / GATE  # of the variance of rows that are inside
+            # share of the variance of rows that are inside the gate
+            inside = chi_square_below(chi_square_point(GATE, rows.dof), rows.dof + 2) / GATE
             information = 0.5 * square + PRIOR_SD**-2.0
             step = (0.5 * (np.sum(r**2) / inside - trace) - u[name] * PRIOR_SD**-2.0) / information
             u[name] += float(np.clip(step, -LEAP, LEAP))

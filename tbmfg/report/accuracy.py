@@ -6,8 +6,8 @@ from dataclasses import replace
 from html import escape
 
 import numpy as np
-from scipy.stats import chi2
 
+from tbmfg.chance import chi_square_point
 from tbmfg.problem import GATE
 from tbmfg.report.content import Report, deviations, error_rotation_sd
 from tbmfg.report.panels import (
@@ -108,7 +108,7 @@ def innovations(report: Report, pen: dict[str, Pen]) -> Figure | None:
     shown: set[str] = set()
     for panel, sensor in enumerate(sensors):
         dof = next(series[sensor].dof for series in report.innovations.values() if sensor in series)
-        for level, dash in ((1.0, "solid"), (float(np.sqrt(chi2.ppf(GATE, dof) / dof)), "dash")):
+        for level, dash in ((1.0, "solid"), (float(np.sqrt(chi_square_point(GATE, dof) / dof)), "dash")):
             line = {"color": "#777777", "width": 1, "dash": dash}
             where = {"x0": 0, "x1": 1, "xref": "paper", "y0": level, "y1": level, "yref": axis_name(panel)}
             figure.layout["shapes"].append({"type": "line", "line": line, **where})

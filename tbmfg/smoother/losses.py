@@ -11,8 +11,8 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy.stats import chi2
 
+from tbmfg.chance import chi_square_point
 from tbmfg.problem import GATE
 from tbmfg.timeseries import Floats
 
@@ -23,13 +23,13 @@ LAST_MU = 1e3  # the loss is the truncated square to a part in 1000
 @cache
 def threshold(dof: int) -> float:
     """Normalised residual from which Huber and Cauchy depart from the square: 95 % of good rows lie below."""
-    return float(np.sqrt(chi2.ppf(0.95, dof)))
+    return float(np.sqrt(chi_square_point(0.95, dof)))
 
 
 @cache
 def gate(dof: int) -> float:
     """Squared normalised residual beyond which a row is gated, and truncated squares end."""
-    return float(chi2.ppf(GATE, dof))
+    return float(chi_square_point(GATE, dof))
 
 
 def weight(nis: Floats, loss: str, dof: int, mu: float | None = None) -> Floats:
