@@ -7,13 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from PyEMD import EMD
 from typer.testing import CliRunner
 
 import datasets
 from tbmfg.cli import app
 from tbmfg.errors import LogError
 from tbmfg.geometry import exp_so3
-from tbmfg.inertial import allan, enhancement
+from tbmfg.inertial import allan, enhancement, modes
 from tbmfg.inertial.steps import Steps, make_steps
 from tbmfg.inertial.strapdown import rotations
 from tbmfg.prepare import prepare
@@ -34,6 +35,25 @@ def pump(seconds: float, seed: int = 0):
 
 
 # ---- modes ----
+
+
+@pytest.mark.parametrize("kind", ["pump", "noise", "walk", "digitised", "short", "ramp"])
+def test_modes_are_the_librarys(kind):
+    """Digitised samples repeat and are zero; a ramp has no modes."""
+    rng = np.random.default_rng(3)
+    x = {
+        "pump": pump(4.0)[1],
+        "noise": rng.standard_normal(800),
+        "walk": np.cumsum(rng.standard_normal(800)),
+        "digitised": np.round(3 * rng.standard_normal(400)),
+        "short": rng.standard_normal(16),
+        "ramp": np.arange(100.0),
+    }[kind]
+    library = EMD()
+    library.emd(x)
+    for mine, expected in zip(modes.modes(x), library.get_imfs_and_residue(), strict=True):
+        assert mine.shape == expected.shape
+        assert_allclose(mine, expected, atol=1e-9 * np.abs(x).max())
 
 
 def test_the_pump_goes_and_the_motion_stays():

@@ -117,11 +117,9 @@ def hann(size: int) -> Floats:
 def threshold(x: Floats, rule: Rule) -> Floats:
     """(1)-(7): one window without its noise. ``noise``: of the modes faster than the one of least energy only what
     stands out is kept (E3); ``kept``: those are dropped and the others thresholded, as printed."""
-    from PyEMD import EMD
+    from tbmfg.inertial.modes import modes as decomposed
 
-    emd = EMD()
-    emd.emd(x)
-    modes, rest = emd.get_imfs_and_residue()
+    modes, rest = decomposed(x)
     if len(modes) < 2:
         return x
     M = int(np.argmin(np.mean(modes[:-1] ** 2, axis=1)))  # (2), (3): the mode of least energy (E1)
