@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from tbmfg.geometry import exp_so3
 from tbmfg.lidar import features
-from tbmfg.lidar.features import distances, near, thinned
+from tbmfg.lidar.features import distances, near, principal, thinned
 from tbmfg.lidar.surfels import SurfelMap
 from tests.problems import EPS
 
@@ -67,6 +69,34 @@ def test_the_printed_ratios_mistake_a_wall():
         np.sum(np.bincount(near(scan, around, test).of, minlength=len(scan)) == 1) for test in ("shape", "printed")
     ]
     assert planes[1] < 0.6 * planes[0]
+
+
+@given(st.integers(0, 2**32), st.sampled_from([(1.0, 1.0, 1.0), (1.0, 1e-3, 1e-6), (5.0, 5.0, 0.0), (3.0, 0.0, 0.0)]))
+def test_principal_axes_are_those_of_the_library(seed, values):
+    rng = np.random.default_rng(seed)
+    Q, scale = np.linalg.qr(rng.standard_normal((3, 3)))[0], 10.0 ** rng.uniform(-8, 8)
+    S = scale * (Q * values) @ Q.T
+    S = 0.5 * (S + S.T)
+    found, axes = np.empty(3), np.empty((3, 3))
+    principal(S.copy(), found, axes)
+    assert_allclose(found, np.linalg.eigvalsh(S)[::-1], atol=20 * EPS * scale * values[0])
+    assert_allclose(axes @ axes.T, np.eye(3), atol=20 * EPS)
+    assert_allclose((axes.T * found) @ axes, S, atol=40 * EPS * scale * values[0])
+
+
+def test_the_nearest_neighbours_are_those_of_a_search_through_all():
+    rng = np.random.default_rng(7)
+    around, points = mapped(room(rng)), rng.uniform(-2.3, 2.0, (200, 3))
+    held = around.moments[around.moments[:, 0] >= features.LEAST]
+    means = held[:, 1:4] / held[:, :1]
+    nearest, place = np.empty(features.NEIGHBOURS), np.empty((features.NEIGHBOURS, 3))
+    cells = np.floor(means / around.voxel)
+    for point in points:
+        count = features._neighbours(point, around.voxel, around.keys, around.moments, nearest, place)
+        near_by = np.abs(cells - np.floor(point / around.voxel)).max(axis=1) <= features.REACH
+        expected = np.sort(np.sum((means[near_by] - point) ** 2, axis=1))[: features.NEIGHBOURS]
+        assert count == len(expected)
+        assert_allclose(nearest[:count], expected, rtol=1e-12)
 
 
 def test_where_there_is_no_map_or_only_dust_there_are_no_features():

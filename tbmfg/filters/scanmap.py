@@ -214,7 +214,8 @@ class ScanMap:
             sigma = float(np.clip(1.4826 * np.median(np.abs(r)), sigma, SIGMA_M[1]))
             weight = 1.0 / (1.0 + (r / (KERNEL * sigma)) ** 2) ** 2
             share = found.points / len(points)
-            F = np.einsum("k,kt,kti,ktj->ij", weight, found.doubt, tilted, tilted)
+            doubted = (np.sqrt(weight[:, None] * found.doubt)[:, :, None] * tilted).reshape(-1, 6)
+            F = doubted.T @ doubted
         H, g = D.T @ (weight[:, None] * D), D.T @ (weight * r)
         # along what noise of the normals alone would tell as much nothing is told: as in lidar.registration
         ratio, V = eigh(H, F + TINY * np.diag(np.diag(H)))

@@ -8,12 +8,12 @@ and make a patch of a metre, where the raw points of a few beams would make a li
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
 from numba import njit
 
-from tbmfg.geometry import skew
 from tbmfg.lidar.surfels import EMPTY, FEW, TILT_SD, SurfelMap, find, key_of
 from tbmfg.timeseries import Floats
 
@@ -25,6 +25,10 @@ REACH = 2  # voxels on either side within which neighbours are sought
 THIN = 0.1  # E19: largest ratio of a variance to the next larger one, across an edge or a plane
 FLAT, SHARP = 0.37, 2.1  # (30): gamma of a plane and Gamma of an edge
 NONE, PLANE, EDGE = 0, 1, 2
+SWEEPS, ROUNDING = 30, 1e-32  # Jacobi's, and the square of off-diagonal elements that ends them
+
+_STEPS = np.array(list(product(range(-REACH, REACH + 1), repeat=3)))
+AROUND = _STEPS[np.argsort(np.sum(_STEPS**2, axis=1), kind="stable")]  # voxels around one, the near ones first
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +37,7 @@ class Features:
 
     ``of`` (k,) is the row's point, ``direction`` (k, 3) the unit vector that its distance is measured along, ``mean``
     (k, 3) m a point of the feature. ``tilts`` (k, 2, 3) are the axes that ``direction`` may err towards, and
-    ``doubt`` (k, 2) by which variance [rad^2].
+    ``doubt`` (k, 2) by which variance [rad^2]. ``points`` have a feature.
     """
 
     of: np.ndarray
@@ -41,18 +45,12 @@ class Features:
     mean: Floats
     tilts: Floats
     doubt: Floats
-
-    @property
-    def points(self) -> int:
-        """How many points have a feature."""
-        return len(np.unique(self.of))
+    points: int
 
 
 def thinned(points: Floats, voxel: float) -> Floats:
     """The first point (k, 3) in each voxel."""
-    cells = np.floor(points / voxel).astype(np.int64)
-    keys = (cells[:, 0] << 42) ^ ((cells[:, 1] & 0x1FFFFF) << 21) ^ (cells[:, 2] & 0x1FFFFF)
-    return points[np.sort(np.unique(keys, return_index=True)[1])]
+    return points[_firsts(points, voxel)]
 
 
 def near(points: Floats, around: SurfelMap, test: Test = "shape") -> Features:
@@ -73,6 +71,7 @@ def near(points: Floats, around: SurfelMap, test: Test = "shape") -> Features:
         mean=np.concatenate([mean[of] for of, _, _ in rows]),
         tilts=np.concatenate([axes[of][:, tilts] for of, _, tilts in rows]),
         doubt=np.concatenate(doubt),
+        points=len(planes) + len(edges),
     )
 
 
@@ -82,12 +81,34 @@ def distances(points: Floats, R: Floats, p: Floats, features: Features) -> tuple
     own = points[features.of]
     reached = own @ R.T + p
     r = np.einsum("ki,ki->k", features.direction, reached - features.mean)
-    turn = -R @ skew(own)
+    J, tilted = np.empty((len(r), 6)), np.empty((len(r), 2, 6))
+    J[:, 3:], tilted[:, :, 3:] = features.direction, features.tilts
+    J[:, :3] = _cross(own, features.direction @ R)
+    tilted[:, :, :3] = _cross(own[:, None], features.tilts @ R)
+    return r, J, tilted
 
-    def along(directions: Floats) -> Floats:
-        return np.concatenate([np.einsum("k...i,kij->k...j", directions, turn), directions], axis=-1)
 
-    return r, along(features.direction), along(features.tilts)
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of vectors (..., 3); numpy's own takes three times as long."""
+    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+
+
+@njit(cache=True)
+def _firsts(points, voxel):
+    """Rows of the first point in each voxel, in order."""
+    size = 1
+    while size < 2 * len(points):
+        size *= 2
+    keys, rows, count = np.full(size, EMPTY), np.empty(len(points), np.int64), 0
+    for n in range(len(points)):
+        key = key_of(points[n, 0], points[n, 1], points[n, 2], voxel)
+        place = find(key, keys)
+        if keys[place] == EMPTY:
+            keys[place] = key
+            rows[count] = n
+            count += 1
+    return rows[:count]
 
 
 @njit(cache=True)
@@ -96,25 +117,61 @@ def _patches(points, voxel, keys, moments, printed):
     n = len(points)
     kind, mean = np.zeros(n, np.int8), np.zeros((n, 3))
     axes, variance = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    nearest, place = np.empty(NEIGHBOURS), np.empty((NEIGHBOURS, 3))
+    nearest, place, S = np.empty(NEIGHBOURS), np.empty((NEIGHBOURS, 3)), np.empty((3, 3))
     for row in range(n):
         found = _neighbours(points[row], voxel, keys, moments, nearest, place)
         if found < NEIGHBOURS:
             continue
-        centre, S = np.zeros(3), np.zeros((3, 3))
-        for k in range(NEIGHBOURS):
-            for a in range(3):
-                centre[a] += place[k, a] / NEIGHBOURS
-        about = points[row] if printed else centre  # E19
-        for k in range(NEIGHBOURS):
-            for a in range(3):
-                for b in range(3):
+        for a in range(3):
+            for k in range(NEIGHBOURS):
+                mean[row, a] += place[k, a] / NEIGHBOURS
+        about = points[row] if printed else mean[row]  # E19
+        for a in range(3):
+            for b in range(a + 1):
+                S[a, b] = 0.0
+                for k in range(NEIGHBOURS):
                     S[a, b] += (place[k, a] - about[a]) * (place[k, b] - about[b]) / NEIGHBOURS
-        value, vector = np.linalg.eigh(S)
-        mean[row], variance[row] = centre, value[::-1]
-        axes[row] = vector.T[::-1]
-        kind[row] = _kind(value[2], value[1], value[0], printed)
+                S[b, a] = S[a, b]
+        principal(S, variance[row], axes[row])
+        kind[row] = _kind(variance[row, 0], variance[row, 1], variance[row, 2], printed)
     return kind, mean, axes, variance
+
+
+@njit(cache=True)
+def principal(S, values, vectors):
+    """Eigenvalues of a symmetric ``S`` (3, 3), largest first, into ``values`` (3,), their unit vectors into the rows of
+    ``vectors`` (3, 3); ``S`` is overwritten. Jacobi's rotations: a library's call takes ten times as long."""
+    for a in range(3):
+        for b in range(3):
+            vectors[a, b] = 1.0 if a == b else 0.0
+    for _ in range(SWEEPS):
+        if S[0, 1] ** 2 + S[0, 2] ** 2 + S[1, 2] ** 2 <= ROUNDING * (S[0, 0] ** 2 + S[1, 1] ** 2 + S[2, 2] ** 2):
+            break
+        for p in range(2):
+            for q in range(p + 1, 3):
+                if S[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                if theta < 0.0:
+                    t = -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(3):
+                    S[k, p], S[k, q] = c * S[k, p] - s * S[k, q], s * S[k, p] + c * S[k, q]
+                for k in range(3):
+                    S[p, k], S[q, k] = c * S[p, k] - s * S[q, k], s * S[p, k] + c * S[q, k]
+                    vectors[p, k], vectors[q, k] = (
+                        c * vectors[p, k] - s * vectors[q, k],
+                        s * vectors[p, k] + c * vectors[q, k],
+                    )
+    for a in range(3):
+        values[a] = S[a, a]
+    for a, b in ((0, 1), (1, 2), (0, 1)):
+        if values[a] < values[b]:
+            values[a], values[b] = values[b], values[a]
+            for k in range(3):
+                vectors[a, k], vectors[b, k] = vectors[b, k], vectors[a, k]
 
 
 @njit(cache=True)
@@ -132,26 +189,36 @@ def _kind(l1, l2, l3, printed):
 def _neighbours(point, voxel, keys, moments, nearest, place):
     """Put the map's points nearest to ``point`` into ``place``, their squared distances into ``nearest``, in order;
     how many there are."""
-    count = 0
-    for i in range(-REACH, REACH + 1):
-        for j in range(-REACH, REACH + 1):
-            for k in range(-REACH, REACH + 1):
-                key = key_of(point[0] + i * voxel, point[1] + j * voxel, point[2] + k * voxel, voxel)
-                row = find(key, keys)
-                if keys[row] == EMPTY or moments[row, 0] < LEAST:
-                    continue
-                share = 1.0 / moments[row, 0]
-                x, y, z = share * moments[row, 1], share * moments[row, 2], share * moments[row, 3]
-                d = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
-                if count == NEIGHBOURS and d >= nearest[count - 1]:
-                    continue
-                at = min(count, NEIGHBOURS - 1)
-                while at > 0 and nearest[at - 1] > d:
-                    nearest[at] = nearest[at - 1]
-                    for a in range(3):
-                        place[at, a] = place[at - 1, a]
-                    at -= 1
-                nearest[at] = d
-                place[at, 0], place[at, 1], place[at, 2] = x, y, z
-                count = min(count + 1, NEIGHBOURS)
+    count, inside = 0, np.empty(3)
+    for a in range(3):
+        inside[a] = point[a] - np.floor(point[a] / voxel) * voxel
+    for at in range(len(AROUND)):
+        off = AROUND[at]
+        if count == NEIGHBOURS:
+            # the voxel may lie farther away than all that were found
+            least = 0.0
+            for a in range(3):
+                if off[a] != 0:
+                    side = off[a] * voxel - inside[a] if off[a] > 0 else inside[a] - (off[a] + 1) * voxel
+                    least += side * side
+            if least >= nearest[count - 1]:
+                continue
+        key = key_of(point[0] + off[0] * voxel, point[1] + off[1] * voxel, point[2] + off[2] * voxel, voxel)
+        row = find(key, keys)
+        if keys[row] == EMPTY or moments[row, 0] < LEAST:
+            continue
+        share = 1.0 / moments[row, 0]
+        x, y, z = share * moments[row, 1], share * moments[row, 2], share * moments[row, 3]
+        d = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
+        if count == NEIGHBOURS and d >= nearest[count - 1]:
+            continue
+        k = min(count, NEIGHBOURS - 1)
+        while k > 0 and nearest[k - 1] > d:
+            nearest[k] = nearest[k - 1]
+            for a in range(3):
+                place[k, a] = place[k - 1, a]
+            k -= 1
+        nearest[k] = d
+        place[k, 0], place[k, 1], place[k, 2] = x, y, z
+        count = min(count + 1, NEIGHBOURS)
     return count
