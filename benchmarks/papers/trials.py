@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.rows import Row
-from benchmarks.runs import epochs, in_memory, true_states
+from benchmarks.runs import epochs, held, in_memory, true_states
 from benchmarks.workers import run_all
 from tbmfg.errors import TbmfgError
 
@@ -87,7 +87,7 @@ def run(trial: Trial) -> list[Outcome]:
         if trial.seed % method.every:
             continue
         try:
-            problem = problem or prepare(in_memory(simulation), rig)
+            problem = problem or prepare(held(in_memory(simulation)), rig)
             result = estimate(method.estimator, replace(problem, rig=override(rig, method.settings)))
             outcomes.append(_measured(trial, method.label, simulation, result, duration_s))
             results[method.label] = result
