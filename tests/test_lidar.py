@@ -17,7 +17,7 @@ from tbmfg.evaluation.metrics import trajectory_errors
 from tbmfg.geometry import exp_so3
 from tbmfg.lidar import clouds, registration
 from tbmfg.lidar.motion import Blind, Inertia, compensate
-from tbmfg.lidar.odometry import Odometry, whitening
+from tbmfg.lidar.odometry import Odometry, Slides, slides, whitening
 from tbmfg.lidar.surfels import SurfelMap
 from tbmfg.prepare import prepare
 from tbmfg.rig import Lidar
@@ -313,3 +313,50 @@ def test_a_lost_scan_is_no_end_of_a_step():
     # the map stood still meanwhile: the step from the last placed scan is told
     assert back.healthy
     assert back.root.any()
+
+
+def test_slides_are_translations_found_in_whatever_mixture_of_weak_directions():
+    rng = np.random.default_rng(2)
+    along, roll = np.zeros((6, 2)).T
+    along[3], roll[0], roll[3:] = 1.0, 1.0, np.cross([0.0, 1.0, -0.5], [1.0, 0.0, 0.0])  # of a pipe: it rolls as well
+    mixture = np.column_stack([along, roll]) @ rng.normal(size=(2, 2))
+    assert_allclose(np.abs(slides(mixture)), [[1.0], [0.0], [0.0]], atol=1e-9)
+    assert slides(roll[:, None]).shape == (3, 0)
+    assert slides(np.zeros((6, 0))).shape == (3, 0)
+    noisy = along + np.append(rng.normal(size=3) * 7e-3, np.zeros(3))
+    assert_allclose(np.abs(slides(noisy[:, None])), [[1.0], [0.0], [0.0]], atol=1e-9)
+    plane = np.eye(6)[:, [2, 3, 4]] @ rng.normal(size=(3, 3))
+    assert_allclose(slides(plane) @ slides(plane).T, np.diag([1.0, 1.0, 0.0]), atol=1e-9)
+
+
+def scattered(count: int, turn_per_scan: float = 0.0):
+    """Informations and weak directions of a way along a tunnel, as noisy normals find it, and its true direction."""
+    rng = np.random.default_rng(3)
+    for k in range(count):
+        direction = np.array([np.cos(k * turn_per_scan), np.sin(k * turn_per_scan), 0.0])
+        weak = np.concatenate([rng.normal(size=3) * 7e-3, direction + rng.normal(size=3) * 5e-3])
+        weak /= np.linalg.norm(weak)
+        held = np.eye(6) - np.outer(weak, weak)
+        yield held @ np.diag([900.0, 450.0, 250.0, 90.0, 90.0, 90.0]) ** 2 @ held, weak[:, None], direction
+
+
+def test_scans_open_each_in_its_own_direction_say_little_of_a_shared_one():
+    usual, alone, together = Slides(), 0.0, 0.0
+    for k, (information, weak, direction) in enumerate(scattered(200)):
+        told = usual.leave_open(np.eye(3), information, weak)
+        if k >= 20:
+            alone += direction @ information[3:, 3:] @ direction
+            together += direction @ told[3:, 3:] @ direction
+    # what is left goes with the variance of a mean of twenty, and without the turns' share
+    assert together < alone / 20
+
+
+def test_what_the_walls_do_tell_is_kept_in_a_curve():
+    usual = Slides()
+    for information, weak, direction in scattered(60, np.deg2rad(1.0)):
+        told = usual.leave_open(np.eye(3), information, weak)
+        across = np.array([-direction[1], direction[0], 0.0])
+        for side in (across, np.array([0.0, 0.0, 1.0])):
+            assert side @ told[3:, 3:] @ side > 0.98 * (side @ information[3:, 3:] @ side)
+        found = np.linalg.eigh(told[3:, 3:])[1][:, 0]
+        assert abs(found @ direction) > np.cos(np.deg2rad(4.0))

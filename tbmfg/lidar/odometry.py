@@ -24,13 +24,15 @@ from tbmfg.timeseries import Floats
 
 LEAST_POINTS = 100  # of a scan that can be registered
 FITS = 0.5  # least share of the points near planes that lie on them; below, the scan is not taken
-USUAL, FEW = 20, 3  # scans over which the usual overlap is taken, and from how many on
+USUAL, FEW = 20, 3  # scans over which what is usual is taken, and from how many on
 SPREAD = 0.02  # least sd of the overlap from scan to scan
 DOUBT = 3.0  # sds by which it falls short of the usual where a pose is in doubt
 TURNS = np.deg2rad(
     [-15.0, 15.0, -30.0, 30.0, -45.0, 45.0, -60.0, 60.0]
 )  # by which a doubtful scan may have turned beside its prediction
 LOST = 20  # such scans in a row after which the map begins anew
+FAR_M = 20.0  # a turn about an axis at least this far away is a slide, as far as noisy normals can tell
+ASKEW = np.deg2rad(3.0)  # by which a slide may seem to differ from the usual: noise of the normals, or a slow curve
 NEAREST_SD = (2e-4, 1e-3)  # rad and m: no scan is known better than this, whatever its many points say
 ROUGHLY = 2e-3, 50  # KISS-ICP need not settle to the micrometre where planes take over: step and iterations
 FORGET_EVERY = 50  # scans after which what is out of range is forgotten
@@ -75,6 +77,34 @@ class Usual:
         return value < np.mean(self.values) - DOUBT * max(np.std(self.values), SPREAD)
 
 
+class Slides:
+    """In which directions the walls let the LiDAR slide, in the map's axes, as the last scans have it.
+
+    Walls that leave a slide open are blind to it as a mere translation. Noisy normals find it with some turn in it and
+    a little askew, in every scan otherwise; and of a hundred scans, each open in a direction of its own, who knows the
+    turns, as an IMU does, concludes that none was open: errors in variables. What the scans share is where the walls
+    lead.
+    """
+
+    def __init__(self) -> None:
+        self.projectors: deque[Floats] = deque(maxlen=USUAL)
+
+    def leave_open(self, R: Floats, information: Floats, weak: Floats) -> Floats:
+        """``information`` (6, 6) of a pose with attitude R without any along the slides among its ``weak`` directions
+        (6, k): the usual ones, unless the scan's own are clearly others."""
+        own = R @ slides(weak)
+        if own.shape[1] == 0:
+            return information
+        usual = np.linalg.eigh(np.sum([*self.projectors, own @ own.T], axis=0))[1][:, 3 - own.shape[1] :]
+        if np.linalg.svd(usual.T @ own, compute_uv=False).min() < np.cos(ASKEW):
+            self.projectors.clear()
+            usual = own
+        self.projectors.append(own @ own.T)
+        told = np.eye(6)
+        told[3:, 3:] -= R.T @ usual @ usual.T @ R
+        return told @ information @ told
+
+
 class Odometry:
     """Scan after scan onto a map that grows by them; memory goes with the map within the LiDAR's range."""
 
@@ -90,7 +120,7 @@ class Odometry:
         self.kiss = KissICP(config)
         self.planes = SurfelMap(sensor.voxel)
         self.velocity_0, self.rate_l = np.zeros(3), np.zeros(3)
-        self.usual = Usual()
+        self.usual, self.slides = Usual(), Slides()
         self.last: Pose | None = None
         self.unfit = self.restarts = self.sought = self.scans = 0
 
@@ -133,7 +163,7 @@ class Odometry:
         self.unfit = 0
         if self.last.placed:
             self._learn_velocity(t_s, found)
-        root = whitening(found.information)
+        root = whitening(self.slides.leave_open(found.R, found.information, found.weak))
         weak = found.weak.shape[1]
         self._extend(found.R, found.p, points, dense)
         self.last = Pose(t_s, found.R, found.p, root, found.overlap, found.sigma, weak, found.dust, True, True)
@@ -200,6 +230,14 @@ def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Bl
     odometry = Odometry(sensor, motion)
     for scan, start_s in scans:
         yield odometry.register(scan, start_s)
+
+
+def slides(weak: Floats) -> Floats:
+    """Orthonormal directions (3, j) in which the LiDAR can slide without a turn, of ``weak`` ones (6, k)."""
+    span = np.linalg.qr(np.repeat([FAR_M, 1.0], 3)[:, None] * weak)[0]
+    _, turn, combination = np.linalg.svd(span[:3])
+    turn = np.concatenate([turn, np.zeros(len(combination) - len(turn))])
+    return np.linalg.qr(span[3:] @ combination[turn < np.sqrt(0.5)].T)[0]
 
 
 def whitening(information: Floats, least_sd: tuple[float, float] = NEAREST_SD) -> Floats:
