@@ -138,6 +138,7 @@ def test_thinning_keeps_both_ends_and_every_extreme():
 
 def test_little_is_not_thinned_and_nan_is_no_extreme():
     assert len(extremes(np.zeros(900), 500)) == 900
+    assert len(extremes(np.zeros(0))) == 0, "a sensor of which every row is gated"
     values = np.full(5000, np.nan)
     values[1234] = 1.0
     assert 1234 in extremes(values, 100)

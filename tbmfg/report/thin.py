@@ -17,7 +17,7 @@ FINE_ENOUGH = 1e-4  # of a trace's range: rounding that no plot shows
 def extremes(values: Floats, stretches: int = STRETCHES) -> np.ndarray:
     """Rows of ``values`` (n,) or (n, k) that hold the lowest and the highest of every column in each of ``stretches``
     equal parts, and both ends; all rows where that would not be fewer."""
-    columns = values.reshape(len(values), -1)
+    columns = values[:, None] if values.ndim == 1 else values
     n, k = columns.shape
     if n <= 2 * k * stretches:
         return np.arange(n)
