@@ -47,7 +47,7 @@ def one_trial(file: Path, estimators: list[str], assignments: list[str]) -> list
     from datasets.recordings import broad
     from tbmfg.evaluation.metrics import nees, trajectory_errors
     from tbmfg.geometry import split_yaw_tilt
-    from tbmfg.pipeline import open_session, truth_for
+    from tbmfg.pipeline import open_session
     from tbmfg.state import ROT
 
     with TemporaryDirectory() as folder:
@@ -57,7 +57,7 @@ def one_trial(file: Path, estimators: list[str], assignments: list[str]) -> list
         rows = []
         for name in estimators:
             result, _ = session.estimate(name)
-            truth = truth_for(session.reference, session.log, session.prepared.rig, result.calibration)
+            truth = session.truth(result)
             errors = trajectory_errors(result.trajectory, truth)
             heading, inclination = split_yaw_tilt(errors.rotation_n)
             parts = {"total": np.linalg.norm(errors.rotation_b, axis=1), "heading": heading, "inclination": inclination}

@@ -30,6 +30,7 @@ ERRORS = {  # metric, unit and factor of what tbmfg.evaluation.evaluate returns
 DRAWN = {
     "arm_m": ("lever_arm_m", 1.0),
     "clock_offset_s": ("clock_offset_s", 1.0),
+    "clock_drift_ppm": ("clock_drift_ppm", 1.0),
     "scale": ("scale", 1.0),
     "hard_iron_ut": ("hard_iron_ut", 1.0),
     "tilt_n": ("tilt_deg", np.rad2deg(1.0)),

@@ -86,8 +86,8 @@ def fixed(path: Path, rig: Rig) -> Rig:
     if rig.imu.noise_factor == "auto" or prism.clock_offset_sd:
         problem = prepare(read_log(path), rig)
         settings.append(f"sensors.imu.noise_factor={problem.calibration['noise_factor'].value:.4g}")
-        settings.append(f"sensors.prism.clock_offset_s={problem.clock_offset_s['prism']:.6f}")
-    return override(rig, [*settings, "sensors.prism.clock_offset_sd_s=0"])
+        settings.append(f"sensors.prism.clock_offset_s={problem.clocks['prism'].offset_s:.6f}")
+    return override(rig, [*settings, "sensors.prism.clock_offset_sd_s=0", "sensors.prism.clock_drift_sd_ppm=0"])
 
 
 # ---- run against script ----

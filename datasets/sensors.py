@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from datasets.motion import Kinematics, rotate_back
 from datasets.simulate import START_NS, Scene, Sensed, period_means, ticks
 from tbmfg.rig import Barometer, Imu, Laser, Magnetometer, Odometer, Prism
-from tbmfg.timeseries import NS, Floats, Series
+from tbmfg.timeseries import NS, Floats, Series, Times
 
 DRIVE_HZ = 48.6  # an inverter a little below the mains; read 50 times a second, its field beats at 1.4 Hz
 LOAD_HZ = 0.05  # of a motor's load
@@ -91,12 +91,15 @@ def prism(
     distance = np.linalg.norm(position - np.array(sensor.station_m), axis=1, keepdims=True)
     sigma = sensor.times * (1e-3 * sensor.sigma_mm + 1e-6 * sensor.sigma_ppm * distance)
 
-    def series(offset_s: float, point: Floats) -> Series:
-        stamps = START_NS + t_ns + round(offset_s * NS)
-        return Series(sensor.topic, "geometry_msgs/msg/PointStamped", stamps, {"point": point}, "n")
+    drift_ppm = sensor.clock_drift_ppm + sensor.clock_drift_sd_ppm * rng.standard_normal()
+    late_ns = np.round(offset * NS + 1e-6 * drift_ppm * t_ns).astype(np.int64)
+
+    def series(stamps: Times, point: Floats) -> Series:
+        return Series(sensor.topic, "geometry_msgs/msg/PointStamped", START_NS + stamps, {"point": point}, "n")
 
     measured = position + sigma * np.column_stack(noise)[seen]
-    return Sensed(series(offset, measured), series(0.0, position), {"arm_m": arm, "clock_offset_s": offset})
+    drawn = {"arm_m": arm, "clock_offset_s": offset, "clock_drift_ppm": drift_ppm}
+    return Sensed(series(t_ns + late_ns, measured), series(t_ns, position), drawn)
 
 
 def odometer(

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import binary_closing, median_filter
 
 from tbmfg.chance import chi_square_beyond, poisson_at_least
-from tbmfg.problem import GATE, Problem
+from tbmfg.problem import CLOCK, GATE, Problem
 from tbmfg.rig import kind_of
 from tbmfg.state import ROT, Innovations, Interval, Trajectory
 from tbmfg.timeseries import Floats
@@ -32,6 +32,8 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
     lines = []
     for k in parameters.free:
         sensor, _, what = parameters.names[k].rpartition(".")
+        if what == "clock_drift" and sd[k] * problem.keyframes_s[-1] <= sd[k - 1]:
+            continue  # it moves no stamp by more than the offset's own sd
         if kind_of(sensor) == "barometer":
             lines += _depth(problem, path, sensor, what, float(sd[k]))
         elif not observed(sd[k], parameters.sd[k]):
@@ -72,7 +74,7 @@ def _motion(path: Trajectory, what: str) -> str:
             f"{np.rad2deg(np.ptp(yaw)):.1f} deg about the vertical and by {np.rad2deg(tilt.max()):.1f} deg in tilt"
         )
     speed = np.linalg.norm(path.velocity_n, axis=1)
-    if what == "clock_offset":
+    if what in CLOCK:
         return f"an offset shows in changes of speed, and the machine was never faster than {speed.max():.2g} m/s"
     way = float(np.sum(np.linalg.norm(np.diff(path.position_n, axis=0), axis=1)))
     return (

@@ -41,8 +41,9 @@ def ins(problem: Problem, progress: Progress) -> Result:
     """Error-state Kalman filter with all sensors."""
     from tbmfg.filters import ins as filter_
     from tbmfg.outcome import result
+    from tbmfg.problem import CLOCK
 
-    f = filter_.run(problem, fixed=("clock_offset",), progress=progress)
+    f = filter_.run(problem, fixed=CLOCK, progress=progress)
     out = result(problem, "ins", f.x, f.cov, f.c, f.c_cov, f.nis, f.gated)
     out.warnings += [
         f"{sensor}: after {filter_.REOPEN} rejections in a row the gate was opened, {times} in all"

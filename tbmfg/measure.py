@@ -39,6 +39,18 @@ class Samples:
         return Samples(self.sensor, self.t_s[rows], self.values[rows], sigma)
 
 
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """How late a sensor's stamps are: ``offset_s`` at the first IMU sample, and growing by ``drift`` [s/s]."""
+
+    offset_s: float
+    drift: float = 0.0
+
+    def true(self, t_s: Floats) -> Floats:
+        """IMU times of stamps ``t_s``."""
+        return t_s - self.offset_s - self.drift * t_s
+
+
 def keyframe_edges(rule: Keyframes, edges_s: Floats, end_s: float, fixes_s: Floats) -> np.ndarray:
     """IMU edges at which the keyframes lie, int64 (n,): the span's ends, the edge nearest to every fix (at most
     ``max_rate_hz``), and what fills gaps to ``max_gap_s``.
@@ -99,16 +111,16 @@ def gyro_frame(steps: Steps, gyro: Floats, bias_gyro: Floats) -> GyroFrame:
 def position_rows(
     sensor: PositionSensor,
     fixes: Samples,
-    offset_s: float,
+    clock: Clock,
     keyframes_s: Floats,
     frame: GyroFrame,
     origin_n: Floats,
     calib: slice,
 ) -> Rows:
     """Fixes of a prism or antenna at their true times."""
-    t = fixes.t_s - offset_s
+    t = clock.true(fixes.t_s)
     k = nearest(keyframes_s, t)
-    data = np.column_stack([t - keyframes_s[k], frame.rate(t)])
+    data = np.column_stack([t - keyframes_s[k], frame.rate(t), t])
     ones = np.ones(len(t), dtype=int)
     return Rows(fixes.sensor, "prism", k, k, fixes.values - origin_n, data, fixes.sigma, calib, ones, sensor.loss)
 

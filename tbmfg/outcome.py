@@ -11,7 +11,7 @@ import numpy as np
 from tbmfg import diagnosis
 from tbmfg.chance import chi_square_point
 from tbmfg.geometry import quat_from_matrix
-from tbmfg.problem import GATE, Problem
+from tbmfg.problem import CLOCK, GATE, Problem
 from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats, Times
 
@@ -22,6 +22,7 @@ DEG = 180.0 / np.pi
 PUBLIC = {
     "arm_x": (3, "lever_arm_m", 1.0),
     "clock_offset": (1, "clock_offset_s", 1.0),
+    "clock_drift": (1, "clock_drift_ppm", 1e6),
     "yaw": (2, "mounting_yaw_pitch_deg", DEG),
     "declination": (1, "declination_deg", DEG),
     "iron_x": (3, "hard_iron_ut", 1.0),
@@ -124,8 +125,8 @@ def ungated(beyond: dict[str, np.ndarray]) -> list[str]:
 
 
 def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrated]:
-    """Parameters under their public names: vectors together, units in the name. A clock offset that this estimator has
-    not estimated (sd 0) is the one that ``prepare`` found."""
+    """Parameters under their public names: vectors together, units in the name. A clock that this estimator has not
+    estimated (sd 0) is the one that ``prepare`` found."""
     parameters = problem.parameters
     free, prior_sd = set(parameters.free), parameters.sd
     found: dict[str, Calibrated] = dict(problem.calibration)
@@ -135,10 +136,11 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             continue
         count, public, unit = PUBLIC[what]
         part, value = slice(k, k + count), c[k : k + count]
-        if what == "clock_offset":
+        if what in CLOCK:
             if sd[k] == 0.0 and f"{sensor}_{public}" in found:
                 continue
-            value = value + problem.clock_offset_s[sensor]
+            clock, told = problem.clocks[sensor], problem.rig.sensors[sensor].clock_drift
+            value = value + (clock.offset_s if what == "clock_offset" else clock.drift + told)
         elif what == "iron_x":
             value = value + problem.rig.sensors[sensor].hard_iron_ut
         estimated = k in free

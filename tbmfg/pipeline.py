@@ -130,7 +130,7 @@ class Session:
         """What ``result`` is compared with, None where there is nothing."""
         if self.reference is None:
             return None
-        return truth_for(self.reference, self.log, self.prepared.rig, result.calibration)
+        return truth_for(self.reference, self.log, self.prepared.rig, result.calibration, self.prepared.t0_ns)
 
     def report(self) -> Report:
         """A report on this log that holds no result yet."""
@@ -411,8 +411,9 @@ def dropped_sensors(rig: Rig, without: Collection[str], only: Collection[str]) -
     return tuple(name for name in rig.sensors if name not in kept or name in without)
 
 
-def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Calibrated]) -> Truth:
-    """What :func:`find_truth` found. The rig's own truth gets its arm, and is brought to the IMU's clock.
+def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Calibrated], t0_ns: int) -> Truth:
+    """What :func:`find_truth` found. The rig's own truth gets its arm, and is brought to the IMU's clock, whose first
+    stamp is ``t0_ns``.
 
     Both are as the estimator found them where a sensor sees the same point: what is compared is then where that
     sensor would have seen it.
@@ -423,11 +424,13 @@ def truth_for(reference: str, log: Log, rig: Rig, calibration: Mapping[str, Cali
     name = rig.truth.sensor
     if name is None:
         return replace(truth, arm_b=rig.truth.arm)
-    offset_s, arm_b = rig.sensors[name].clock_offset, rig.sensors[name].arm
+    offset_s, drift, arm_b = (getattr(rig.sensors[name], what) for what in ("clock_offset", "clock_drift", "arm"))
     if f"{name}_clock_offset_s" in calibration:  # else the sensor was left out
         offset_s = calibration[f"{name}_clock_offset_s"].value
+        drift = 1e-6 * calibration[f"{name}_clock_drift_ppm"].value
         arm_b = np.array(calibration[f"{name}_lever_arm_m"].value)
-    return replace(truth, t_ns=truth.t_ns - round(offset_s * NS), arm_b=arm_b)
+    late_ns = np.round(offset_s * NS + drift * (truth.t_ns - t0_ns)).astype(np.int64)
+    return replace(truth, t_ns=truth.t_ns - late_ns, arm_b=arm_b)
 
 
 def peak_rss_mb() -> float | None:

@@ -11,12 +11,13 @@ import numpy as np
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.steps import Steps, to_ns
 from tbmfg.lidar.clouds import Scans
-from tbmfg.measure import Samples
+from tbmfg.measure import Clock, Samples
 from tbmfg.rig import Rig
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Times
 
+CLOCK = ("clock_offset", "clock_drift")  # parameters that say when a row was measured
 GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are counted as gated
 
 
@@ -24,8 +25,8 @@ GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are
 class Parameters:
     """Constant calibrations side by side in one vector: names such as ``prism.arm_x``, prior mean and sd (0: known).
 
-    ``start`` is where an estimator begins: the mean, but for clock offsets, which are counted from the offset that
-    the keyframes were placed with. A filter takes it for the mean.
+    ``start`` is where an estimator begins: the mean, but for clocks, which are counted from the one that the keyframes
+    were placed with. A filter takes it for the mean.
     """
 
     names: tuple[str, ...]
@@ -93,7 +94,7 @@ class Problem:
 
     ``keyframe_edges`` (n,) are the IMU edges at which the keyframes lie.
     ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
-    ``clock_offset_s`` the offsets that the rows were placed with; ``samples`` what the rows were made of, by sensor,
+    ``clocks`` those that the rows were placed with; ``samples`` what the rows were made of, by sensor,
     for filters that take every sample when it comes. ``scans`` are those of every LiDAR, still in the log; ``measured``
     the IMU's steps before any enhancement.
     """
@@ -107,7 +108,7 @@ class Problem:
     drift_walk: Floats
     prior: Prior
     origin_n: Floats
-    clock_offset_s: dict[str, float]
+    clocks: dict[str, Clock]
     samples: dict[str, Samples] = field(default_factory=dict)
     counts: dict[str, Counts] = field(default_factory=dict)
     calibration: dict[str, Calibrated] = field(default_factory=dict)

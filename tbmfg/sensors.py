@@ -57,15 +57,15 @@ def _add_minus_R_skew(J: np.ndarray, x: np.ndarray, v: np.ndarray, scale: float)
 def prism(z, data, xi, xj, c):
     """Prism (or antenna) position in n at the true time of the fix.
 
-    z (3): position [m]. data (4): lag of the fix behind its keyframe [s], angular rate in b [rad/s].
-    c (4): lever arm in b [m], clock offset [s] in excess of the one the keyframes were placed with.
-    h = p + R l + (v + R (w x l)) (lag - offset): the last term is first order in a few milliseconds.
+    z (3): position [m]. data (5): lag of the fix behind its keyframe [s], angular rate in b [rad/s], time t of the fix.
+    c (5): lever arm in b [m], clock offset [s] and drift [s/s] in excess of those the keyframes were placed with.
+    h = p + R l + (v + R (w x l)) (lag - offset - drift t): the last term is first order in a few milliseconds.
     """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji, Jc = np.empty((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, 4))
+    r, Ji, Jc = np.empty((n, 3)), np.zeros((n, 3, d)), np.zeros((n, 3, 5))
     arm = c[:3]
     for k in range(n):
-        x, lag, w = xi[k], data[k, 0] - c[3], data[k, 1:4]
+        x, lag, w = xi[k], data[k, 0] - c[3] - c[4] * data[k, 4], data[k, 1:4]
         sweep = np.array([w[1] * arm[2] - w[2] * arm[1], w[2] * arm[0] - w[0] * arm[2], w[0] * arm[1] - w[1] * arm[0]])
         lever = _rotate(x, arm + sweep * lag)
         velocity = x[12:15] + _rotate(x, sweep)
@@ -75,6 +75,7 @@ def prism(z, data, xi, xj, c):
             Ji[k, a, 3 + a] = 1.0
             Ji[k, a, 6 + a] = lag
             Jc[k, a, 3] = -velocity[a]
+            Jc[k, a, 4] = -velocity[a] * data[k, 4]
             for b in range(3):
                 Jc[k, a, b] = x[3 * a + b]
         _add_minus_R_skew(Jc[k, :, 0:3], x, w, -lag)

@@ -182,7 +182,7 @@ def native_problem() -> Problem:
     """A flight whose sensors GTSAM has factors for: prism and its arm, some 50 keyframes."""
     problem = flight_problem(1, 6.0, NATIVE)
     prism = next(rows for rows in problem.rows if rows.sensor == "prism")
-    prism = replace(prism, data=prism.data * [0.0, 1.0, 1.0, 1.0])
+    prism = replace(prism, data=prism.data * [0.0, 1.0, 1.0, 1.0, 1.0])
     return replace(problem, rows=[prism], prior=replace(problem.prior, cov=problem.prior.filter_cov))
 
 

@@ -99,7 +99,11 @@ def test_what_the_truth_does_not_tell_hardly_matters():
     simulation, problem = flight(0, 20.0), flight_problem(0, 20.0)
     x = true_states(simulation, problem)
     drawn, c = simulation.drawn["prism"], problem.parameters.mean.copy()
-    c[problem.parameters.slice("prism")] = [*drawn["arm_m"], drawn["clock_offset_s"] - problem.clock_offset_s["prism"]]
+    c[problem.parameters.slice("prism")] = [
+        *drawn["arm_m"],
+        drawn["clock_offset_s"] - problem.clocks["prism"].offset_s,
+        1e-6 * drawn["clock_drift_ppm"] - problem.clocks["prism"].drift,
+    ]
     exact = bounds.covariances(problem, States(x, c))
     truth = truth_of(simulation, problem)
     half = slice(0, len(x) // 2)

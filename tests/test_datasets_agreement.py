@@ -36,8 +36,8 @@ def test_prism(drive):
     clean = drive.clean["prism"]
     t_s, lag_s = seconds_of(drive, clean), 0.01
     x = packed(drive, t_s - lag_s)
-    data = np.column_stack([np.full(len(t_s), lag_s), drive.truth(t_s - lag_s).omega])
-    residual, *_ = sensors.prism(clean["point"], data, x, x, np.append(drive.drawn["prism"]["arm_m"], 0.0))
+    data = np.column_stack([np.full(len(t_s), lag_s), drive.truth(t_s - lag_s).omega, t_s])
+    residual, *_ = sensors.prism(clean["point"], data, x, x, np.append(drive.drawn["prism"]["arm_m"], [0.0, 0.0]))
     # first order in the lag: half an acceleration of at most 0.2 m/s^2, with the arm's turning in and out
     assert_allclose(residual, 0.0, atol=0.5 * 0.2 * lag_s**2)
 

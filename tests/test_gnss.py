@@ -264,7 +264,7 @@ def track(at: Trajectory, late_ns: int) -> Log:
 def test_truth_of_a_point_with_an_arm_is_met_exactly():
     at = trajectory()
     rig = parse_rig(RIG + "truth: {topic: /truth, arm_m: [0.7, -0.4, 1.9]}", "rig")
-    truth = truth_for("/truth", track(at, 0), rig, {})
+    truth = truth_for("/truth", track(at, 0), rig, {}, 0)
     errors = trajectory_errors(at, truth)
     assert len(errors.rows) == len(at)
     assert_allclose(errors.position_n, 0.0, atol=1e-12)
@@ -277,11 +277,12 @@ def test_truth_of_a_sensors_point_takes_arm_and_clock_as_found():
     at = trajectory()
     found = {
         "gnss_clock_offset_s": Calibrated(-0.2, 0.01, True),
+        "gnss_clock_drift_ppm": Calibrated(0.0, 0.0, False),
         "gnss_lever_arm_m": Calibrated(tuple(ARM), (0.01, 0.01, 0.01), True),
     }
     for entry, calibration in (("", found), (", arm_m: [0.7, -0.4, 1.9], clock_offset_s: -0.2", {})):
         rig = parse_rig(RIG.replace("/fix}", f"/fix{entry}}}") + "truth: {topic: /truth, sensor: gnss}", "rig")
-        errors = trajectory_errors(at, truth_for("/truth", track(at, -NS // 5), rig, calibration))
+        errors = trajectory_errors(at, truth_for("/truth", track(at, -NS // 5), rig, calibration, 0))
         assert len(errors.rows) == len(at)
         assert_allclose(errors.position_n, 0.0, atol=1e-12)
 

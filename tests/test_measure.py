@@ -113,15 +113,15 @@ def test_rate_is_finite_at_and_beyond_the_ends(world):
 def test_prism_rows_hold_at_truth(world):
     simulation, frame, zero_s = world
     clean, arm = simulation.clean["prism"], simulation.drawn["prism"]["arm_m"]
-    offset, origin_n = 0.07, np.array([18.0, -10.0, 5.0])
-    t_s = (clean.t_ns - frame.steps.t0_ns) * 1e-9 + offset
+    clock, origin_n = measure.Clock(0.07, 1e-3), np.array([18.0, -10.0, 5.0])
+    t_s = ((clean.t_ns - frame.steps.t0_ns) * 1e-9 + clock.offset_s) / (1.0 - clock.drift)
     keyframes = np.linspace(frame.steps.edges_s[0], frame.steps.end_s, 1000)  # every 20 ms
     sensor = Prism(topic="/prism", sigma_mm=2, sigma_ppm=1, station_m=(1.0, 2.0, 3.0))
     sigma = np.repeat(sensor.sigma_at(clean["point"])[:, None], 3, axis=1)
     samples = Samples("prism", t_s, clean["point"], sigma)
-    rows = measure.position_rows(sensor, samples, offset, keyframes, frame, origin_n, slice(0, 4))
+    rows = measure.position_rows(sensor, samples, clock, keyframes, frame, origin_n, slice(0, 5))
     x = states(simulation, keyframes + zero_s, origin_n)
-    residual, *_ = replace(rows, sigma=np.ones_like(sigma)).evaluate(x, np.append(arm, 0.0))
+    residual, *_ = replace(rows, sigma=np.ones_like(sigma)).evaluate(x, np.append(arm, [0.0, 0.0]))
     # half the acceleration of the prism, 12 m/s^2 at the most, over the lag of 10 ms
     assert np.abs(residual).max() < 0.5 * 12.0 * 0.01**2
     assert_allclose(rows.sigma[:, 0], 2e-3 + 1e-6 * np.linalg.norm(clean["point"] - [1, 2, 3], axis=1), rtol=1e-12)

@@ -138,8 +138,8 @@ def test_calibrations_have_their_names_and_units():
     result = estimate("batch", problem)
     found = result.calibration
     assert set(found) == {
-        "prism_lever_arm_m", "prism_clock_offset_s", "odometer_scale", "odometer_mounting_yaw_pitch_deg",
-        "magnetometer_declination_deg", "magnetometer_hard_iron_ut",
+        "prism_lever_arm_m", "prism_clock_offset_s", "prism_clock_drift_ppm", "odometer_scale",
+        "odometer_mounting_yaw_pitch_deg", "magnetometer_declination_deg", "magnetometer_hard_iron_ut",
         "noise_factor", "noise_factor_gyro", "noise_factor_acc",
     }  # fmt: skip
     estimated = {name for name, value in found.items() if value.estimated}

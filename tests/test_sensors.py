@@ -29,7 +29,7 @@ R_BD = rotation_from_rpy(np.array([np.pi, 0.1, 0.3]))  # of a detector that look
 
 # measured values, auxiliary data, calibrations, and a bound on the third derivatives of h (its size or curvature)
 CASES = {
-    "prism": ([39.1, -70.4, 13.2], [0.013, 0.7, -1.1, 0.9], [0.31, -0.52, 0.83, 0.006], 80.0),
+    "prism": ([39.1, -70.4, 13.2], [0.013, 0.7, -1.1, 0.9, 7.0], [0.31, -0.52, 0.83, 0.006, 1e-3], 80.0),
     "odometer": (
         [3.1, 0.2, -0.4],
         [-0.4, 0.3, -1.1, 1.6, -0.3, 0.5, 0.01, -0.02, 0.015, 3.2, 0.15, -0.35],
@@ -53,7 +53,7 @@ CASES = {
 }
 BINARY = {"odometer"}
 CALIBRATIONS = {
-    "prism": ["arm.x", "arm.y", "arm.z", "offset"],
+    "prism": ["arm.x", "arm.y", "arm.z", "offset", "drift"],
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination", "iron.x", "iron.y", "iron.z"],
@@ -143,7 +143,7 @@ def jacobian(factor, values):
 
 
 def test_prism_is_the_gps_factor_with_arm():
-    z, data, c = np.array(CASES["prism"][0]), [0.0, 0.7, -1.1, 0.9], np.array([0.31, -0.52, 0.83, 0.0])
+    z, data, c = np.array(CASES["prism"][0]), [0.0, 0.7, -1.1, 0.9, 50.0], np.array([0.31, -0.52, 0.83, 0.0, 0.0])
     residual, Ji, _, Jc = (part[0] for part in sensors.prism(z[None], np.array([data]), X_I[None], X_I[None], c))
     R = X_I[:9].reshape(3, 3)
     pose, unit = gtsam.Pose3(gtsam.Rot3(R), X_I[9:12]), gtsam.noiseModel.Unit.Create(3)
@@ -170,9 +170,9 @@ def test_prism_between_keyframes_follows_a_turning_flying_body():
     lag, w, arm = 2e-3, np.array([0.7, -1.1, 0.9]), np.array([0.31, -0.52, 0.83])
     R = X_I[:9].reshape(3, 3)
     point = X_I[9:12] + X_I[12:15] * lag + R @ exp_so3(w * lag) @ arm
-    for indicated, offset in ((lag, 0.0), (lag + 0.05, 0.05)):
-        data = np.array([[indicated, *w]])
-        residual, *_ = sensors.prism(point[None], data, X_I[None], X_I[None], np.array([*arm, offset]))
+    for indicated, *clock in ((lag, 0.0, 0.0), (lag + 0.05, 0.05, 0.0), (lag + 0.05, 0.02, 1e-4)):
+        data = np.array([[indicated, *w, 300.0]])
+        residual, *_ = sensors.prism(point[None], data, X_I[None], X_I[None], np.array([*arm, *clock]))
         assert_allclose(residual[0], 0.0, atol=0.5 * (w @ w) * np.linalg.norm(arm) * lag**2)
 
 

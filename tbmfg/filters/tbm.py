@@ -71,12 +71,12 @@ def view(problem: Problem, switches: InsTs, kinds: tuple[str, ...] = ("prism",))
     arms = np.array([".arm_" in name for name in names], dtype=bool)
     if switches.arm == "none":
         mean, start = np.where(arms, 0.0, mean), np.where(arms, 0.0, start)
-    sd = np.where(arms & (switches.arm == "estimated"), sd, 0.0)  # clock offsets are those that prepare has found
+    sd = np.where(arms & (switches.arm == "estimated"), sd, 0.0)  # clocks are those that prepare has found
     parameters = Parameters(names, mean, sd, start)
     frame = gyro_frame(inertial.steps, inertial.gyro, problem.prior.x[BG_])
     rows = [
         position_rows(
-            rig.sensors[name], s, problem.clock_offset_s[name], inertial.steps.edges_s, frame, problem.origin_n,
+            rig.sensors[name], s, problem.clocks[name], inertial.steps.edges_s, frame, problem.origin_n,
             parameters.slice(name),
         )
         for name, s in samples.items()

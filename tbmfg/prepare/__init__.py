@@ -1,7 +1,7 @@
 """From a log and a rig to the problem that every estimator solves: once per log, alike for all.
 
-Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, inertial enhancement, and the clock
-offset and the noise factor of the IMU, found from the log itself.
+Time repair, initial alignment, keyframes and rows; and, where the rig asks for it, inertial enhancement, and clock
+offsets and drifts and the noise factor of the IMU, found from the log itself.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from tbmfg import gnss
 from tbmfg.errors import EstimationError, RigError
 from tbmfg.inertial.steps import to_ns
+from tbmfg.measure import Clock
 from tbmfg.prepare import enhance, magnetic, scans, search, stream
 from tbmfg.prepare.samples import ALONE, imu_steps, is_position, usable_samples
 from tbmfg.prepare.start import align, parameters_of
@@ -60,8 +61,8 @@ def prepare(
             scans.register(log, name, setup, outages, lambda share: tell("LiDAR odometry", share))
         setup.parameters = parameters_of(rig, setup.samples)
         delays = magnetic.onto_gyro_clock(setup)
-        offsets = {name: rig.sensors[name].clock_offset for name in samples if is_position(rig, name)}
-        problem = search.find(setup, offsets, tell)
+        clocks = {name: Clock(rig.sensors[name].clock_offset) for name in samples if is_position(rig, name)}
+        problem = search.find(setup, clocks, tell)
         problem.calibration |= told | delays | setup.calibration
         problem.measured, problem.scans = measured, setup.scans
     problem.intervals = [

@@ -1,4 +1,4 @@
-"""The problem for given clock offsets and noise: keyframes, rows, first state and prior."""
+"""The problem for given clocks and noise: keyframes, rows, first state and prior."""
 
 from __future__ import annotations
 
@@ -8,44 +8,47 @@ import numpy as np
 
 from tbmfg import measure
 from tbmfg.errors import EstimationError
+from tbmfg.measure import Clock
 from tbmfg.prepare.samples import ALONE, is_position
 from tbmfg.prepare.scans import lidar_rows
 from tbmfg.prepare.start import Setup
-from tbmfg.problem import Inertial, Prior, Problem
+from tbmfg.problem import CLOCK, Inertial, Parameters, Prior, Problem
 from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, kind_of
 from tbmfg.state import BG, NAV, ROT
 from tbmfg.timeseries import Floats
 
+ON_TIME = Clock(0.0)
 GYROCOMPASS_SLACK = np.deg2rad(0.1)  # of the coarse heading beside the bias: noise and motion of the still stretch
 
 
-def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float | None = None) -> Problem:
-    """The problem for given clock offsets and noise factors (gyro, accelerometer), up to ``end_s``."""
+def build(setup: Setup, clocks: dict[str, Clock], factors: Floats, end_s: float | None = None) -> Problem:
+    """The problem for given clocks and noise factors (gyro, accelerometer), up to ``end_s``."""
     rig, steps = setup.rig, setup.steps
     end_s = steps.end_s if end_s is None else min(end_s, steps.end_s)
     samples = {
         name: s.select(rows)
         for name, s in setup.samples.items()
-        if (rows := s.t_s - offsets.get(name, 0.0) <= end_s).sum() >= 2
+        if (rows := clocks.get(name, ON_TIME).true(s.t_s) <= end_s).sum() >= 2
     }
     mean, begin = setup.parameters.mean.copy(), setup.parameters.mean.copy()
-    for name, offset in offsets.items():
-        k = setup.parameters.names.index(f"{name}.clock_offset")
-        mean[k], begin[k] = mean[k] - offset, 0.0
+    for name, clock in clocks.items():
+        own = clock_of(setup.parameters, name)
+        mean[own] -= clock.offset_s, clock.drift
+        begin[own] = 0.0
     parameters = replace(setup.parameters, mean=mean, start=begin)
 
-    fixes = [s.t_s - offsets[name] for name, s in samples.items() if is_position(rig, name)]
+    fixes = [clocks[name].true(s.t_s) for name, s in samples.items() if is_position(rig, name)]
     scans = [s.t_s for name, s in samples.items() if isinstance(rig.sensors[name], Lidar)]
     surveyed = measure.survey_times(rig.survey, steps)
     fixes_s = np.sort(np.concatenate([*fixes, *scans, surveyed]))
     edges = measure.keyframe_edges(rig.keyframes, steps.edges_s, end_s, fixes_s)
     keyframes = steps.edges_s[edges]
-    position, velocity = first_state(setup, offsets)
+    position, velocity = first_state(setup, clocks)
     rows, drift_names, drift_walk, drift_sd, drift_start = [], [], [], [], []
     for name, s in samples.items():
         sensor, calib = rig.sensors[name], parameters.slice(name)
         if isinstance(sensor, PositionSensor):
-            rows.append(measure.position_rows(sensor, s, offsets[name], keyframes, setup.frame, setup.origin_n, calib))
+            rows.append(measure.position_rows(sensor, s, clocks[name], keyframes, setup.frame, setup.origin_n, calib))
         elif isinstance(sensor, Odometer):
             rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
         elif isinstance(sensor, Magnetometer):
@@ -89,11 +92,17 @@ def build(setup: Setup, offsets: dict[str, float], factors: Floats, end_s: float
     prior = prior_of(setup, x, np.array(drift_sd), bool(fixes) or "start" in [point.at for point in rig.survey])
     return Problem(
         rig, inertial, edges, rows, parameters, tuple(drift_names), np.array(drift_walk), prior, setup.origin_n,
-        dict(offsets), samples, setup.counts, {}, [], setup.warnings,
+        dict(clocks), samples, setup.counts, {}, [], setup.warnings,
     )  # fmt: skip
 
 
-def first_state(setup: Setup, offsets: dict[str, float]) -> tuple[Floats, Floats]:
+def clock_of(parameters: Parameters, sensor: str) -> slice:
+    """Where the clock of ``sensor`` lies among ``parameters``: offset and drift."""
+    first = parameters.names.index(f"{sensor}.{CLOCK[0]}")
+    return slice(first, first + len(CLOCK))
+
+
+def first_state(setup: Setup, clocks: dict[str, Clock]) -> tuple[Floats, Floats]:
     """Position (from the origin) and velocity in n at the first edge: from the rig, else from the first fixes,
     else from a point surveyed at the start."""
     rig = setup.rig
@@ -101,7 +110,7 @@ def first_state(setup: Setup, offsets: dict[str, float]) -> tuple[Floats, Floats
     for name, s in setup.samples.items():
         if not is_position(rig, name):
             continue
-        t = s.t_s - offsets[name] - setup.steps.edges_s[0]
+        t = clocks[name].true(s.t_s) - setup.steps.edges_s[0]
         rows = t < t[0] + 2.0
         degree = 1 if rows.sum() >= 5 and t[0] < 1.0 else 0
         fit = np.polynomial.polynomial.polyfit(t[rows], s.values[rows], degree)

@@ -122,6 +122,7 @@ def usable_samples(log, rig, steps, outages, without, warnings) -> tuple[dict[st
             continue
         t = seconds(series.t_ns, steps.t0_ns)
         out = hidden(name, t, outages)
+        t = t - getattr(sensor, "clock_drift", 0.0) * t  # what is known of it; from here on the rest is meant
         offset, spread = getattr(sensor, "clock_offset", 0.0), 3.0 * getattr(sensor, "clock_offset_sd", 0.0)
         inside = (t - offset - spread >= steps.edges_s[0]) & (t - offset + spread <= steps.end_s)
         count.outage = int(out.sum())

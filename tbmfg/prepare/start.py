@@ -185,6 +185,7 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
         if isinstance(sensor, PositionSensor):
             entries += [(f"{name}.arm_{axis}", sensor.arm[k], sensor.arm_sd) for k, axis in enumerate("xyz")]
             entries += [(f"{name}.clock_offset", sensor.clock_offset, sensor.clock_offset_sd)]
+            entries += [(f"{name}.clock_drift", 0.0, sensor.clock_drift_sd)]  # beside the one in the rig
         elif isinstance(sensor, Odometer):
             entries += [(f"{name}.scale", sensor.scale, sensor.scale_sd)]
             entries += [(f"{name}.{axis}", getattr(sensor, axis), sensor.mounting_sd) for axis in ("yaw", "pitch")]

@@ -136,12 +136,20 @@ class PositionSensor(Sensor):
     arm_sd_m: CalibrationSd = Field(0.0, description="Per axis; 0 or null: the arm is not estimated.")
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time; positive when stamps are late.")
     clock_offset_sd_s: CalibrationSd = Field(0.0, description="0 or null: the offset is not estimated.")
+    clock_drift_ppm: Number = Field(
+        0.0, description="By how much the offset grows; clock_offset_s is then that of the log's start."
+    )
+    clock_drift_sd_ppm: CalibrationSd = Field(
+        0.0, description="Of two quartz clocks 10 or so; 0 or null: the drift is not estimated."
+    )
     loss: Loss = Field("huber", description="Weight of outliers in the graph.")
 
     arm = si("arm_m")
     arm_sd = si("arm_sd_m")
     clock_offset = si("clock_offset_s")
     clock_offset_sd = si("clock_offset_sd_s")
+    clock_drift = si("clock_drift_ppm", PPM)
+    clock_drift_sd = si("clock_drift_sd_ppm", PPM)
 
 
 class Prism(PositionSensor):

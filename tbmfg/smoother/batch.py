@@ -9,7 +9,7 @@ import numpy as np
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_path, correct_states
-from tbmfg.problem import Problem
+from tbmfg.problem import CLOCK, Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
@@ -18,7 +18,7 @@ from tbmfg.timeseries import Floats
 
 MAX_ITERATIONS = 100  # by weights of outliers that follow the state it converges linearly
 STAGE_ITERATIONS = 2  # at each loss on the way to the truncated square
-OFFSET_REACH_S = 0.02  # a clock offset beyond the one found by ``prepare``: the prism's model is first order in it
+CLOCK_REACH_S = 0.02  # of a clock beyond the one found by ``prepare``: the prism's model is first order in it
 # a step that does not pay is tried along the path, which reaches farther where nothing holds the heading, and shorter
 TRIES = ((correct_states, 1.0), (correct_path, 1.0), (correct_path, 0.3))
 CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
@@ -64,7 +64,9 @@ class _Descent:
         self.problem, self.states, self.progress = problem, states, progress
         self.imu = graph.imu_graph(problem, states.x), graph.no_bias(len(states.x))
         names = problem.parameters.names
-        self.clocks = [k for k in problem.parameters.free if names[k].endswith("clock_offset")]
+        self.clocks = [k for k in problem.parameters.free if names[k].endswith(CLOCK)]
+        span = problem.keyframes_s[-1]
+        self.reach = np.array([CLOCK_REACH_S / (span if names[k].endswith("drift") else 1.0) for k in self.clocks])
         self.iterations = 0
         self.blocks, self.nis = [], {}
 
@@ -80,7 +82,7 @@ class _Descent:
             for correct, part in TRIES:
                 c = self.states.c.copy()
                 c[free] += part * dc
-                c[self.clocks] = np.clip(c[self.clocks], -OFFSET_REACH_S, OFFSET_REACH_S)
+                c[self.clocks] = np.clip(c[self.clocks], -self.reach, self.reach)
                 candidate = States(correct(self.states.x, part * dx), c)
                 blocks, nis, new_cost = _linearise(problem, self.imu, candidate, free, mu)
                 if paid := bool(np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-9) + 1e-9):

@@ -1,7 +1,7 @@
 """The same problem as GTSAM factors, keyframe by keyframe, for the incremental solvers.
 
 Native factors where one fits (IMU, prism, zero velocity, priors); the shared models inside a CustomFactor elsewhere.
-Clock offsets are those found by ``prepare``.
+Clocks are those found by ``prepare``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from gtsam import noiseModel
 from gtsam.symbol_shorthand import A, B, C, D, V, X
 
-from tbmfg.problem import Problem
+from tbmfg.problem import CLOCK, Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother.graph import preintegrate
 from tbmfg.smoother.losses import threshold
@@ -54,7 +54,7 @@ class Factors:
         free = problem.parameters.free
         self.free = [free[(free >= r.calib.start) & (free < r.calib.stop)] for r in problem.rows]
         names = problem.parameters.names
-        self.free = [[k for k in own if not names[k].endswith("clock_offset")] for own in self.free]
+        self.free = [[k for k in own if not names[k].endswith(CLOCK)] for own in self.free]
         self.known: set[int] = set()
 
     def constant_key(self, sensor: int) -> int | None:

@@ -4,7 +4,7 @@ The window is a short chain of the batch smoother's own rows. What the QR elimin
 on is what that keyframe leaves when its time is up: linear rows on its neighbour and the constants (Dong-Si & Mourikis
 2011, in square-root form). Constants stay. Rows are linearised anew, and the weights of their losses found again, from
 the first keyframe on whose residuals have moved; what lies before it is not eliminated again (fluid relinearisation,
-Kaess et al. 2012, on a chain). Clock offsets are those found by ``prepare``.
+Kaess et al. 2012, on a chain). Clocks are those found by ``prepare``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
-from tbmfg.problem import Problem
+from tbmfg.problem import CLOCK, Problem
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination
 from tbmfg.smoother.graph import States
@@ -202,7 +202,7 @@ def _most_rows(problem: Problem) -> tuple[int, int]:
 def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None = None) -> Online:
     """Smooth online over ``lag_s`` seconds. Raises EstimationError where the start is not determined."""
     times, names = problem.keyframes_s, problem.parameters.names
-    free = np.array([k for k in problem.parameters.free if not names[k].endswith("clock_offset")], dtype=int)
+    free = np.array([k for k in problem.parameters.free if not names[k].endswith(CLOCK)], dtype=int)
     out = Online.empty(problem)
     window = _Window(problem, free, 0, problem.prior.x, problem.prior.filter_cov)
     for k in range(len(times)):
