@@ -297,11 +297,16 @@ def rotation_rows(keyframes_s: Floats, intervals: list[tuple[float, float]], wal
     return Rows("zero_rotation", "rotation", i, i + 1, empty, empty, np.tile(sigma[:, None], 3), slice(0, 0), ones)
 
 
+def within(t_s: Floats, start: float, end: float) -> slice:
+    """Which of the times, which are in order, lie from ``start`` to ``end``."""
+    return slice(np.searchsorted(t_s, start), np.searchsorted(t_s, end, side="right"))
+
+
 def _stretch_of(t_s: Floats, intervals: list[tuple[float, float]]) -> np.ndarray:
-    """Number of the interval that each time lies in, -1 outside of all."""
+    """Number of the interval that each of the times, which are in order, lies in, -1 outside of all."""
     found = np.full(len(t_s), -1)
-    for number, (start, end) in enumerate(intervals):
-        found[(t_s >= start) & (t_s <= end)] = number
+    for number, interval in enumerate(intervals):
+        found[within(t_s, *interval)] = number
     return found
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps
-from tbmfg.measure import Samples
+from tbmfg.measure import Samples, within
 from tbmfg.rig import Odometer, PositionSensor, Rig
 from tbmfg.timeseries import Floats
 
@@ -68,15 +68,16 @@ def _confirmed(
         for name, s in samples.items():
             sensor = rig.sensors[name]
             t = s.t_s - getattr(sensor, "clock_offset", 0.0)
-            rows = (t >= start) & (t <= end)
-            if rows.sum() < 3:
+            rows = within(t, start, end)
+            count = rows.stop - rows.start
+            if count < 3:
                 continue
             values = s.values[rows]
             if isinstance(sensor, PositionSensor):
                 spread = np.abs(values - np.median(values, axis=0)).max(axis=1)
                 resting = bool(np.all(spread < 5.0 * s.sigma[rows].max(axis=1)))
             elif isinstance(sensor, Odometer):
-                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(rows.sum()) + 1e-3)
+                resting = bool(abs(np.mean(values)) < 3.0 * sensor.sigma / np.sqrt(count) + 1e-3)
             else:
                 continue
             # the stamps' offset may be unknown: leave its spread free on either side
