@@ -13,8 +13,8 @@ from tbmfg import earth, gnss
 from tbmfg.errors import LogError, RigError
 from tbmfg.evaluation.metrics import at_point, trajectory_errors
 from tbmfg.geometry import exp_so3, matrix_from_quat, quat_from_matrix
+from tbmfg.given import truth_for
 from tbmfg.mcap import read_log, write_log
-from tbmfg.pipeline import truth_for
 from tbmfg.prepare import prepare
 from tbmfg.rig import load_rig, parse_rig
 from tbmfg.state import POS, ROT, Calibrated, Trajectory
