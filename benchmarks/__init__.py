@@ -26,5 +26,6 @@ BENCHMARKS = {
     "scale": "benchmarks.scale",
     "lidar": "benchmarks.lidar",
     "scans": "benchmarks.scans",
+    "maps": "benchmarks.maps",
     "papers": "benchmarks.papers",
 }

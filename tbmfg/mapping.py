@@ -1,11 +1,13 @@
-"""The map that a log's LiDAR scans make along an estimated trajectory, and how sharp it is."""
+"""The map that a log's LiDAR scans make along an estimated trajectory, without what hangs in the air; its sharpness."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -13,6 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 from tbmfg.errors import TbmfgError
 from tbmfg.inertial.steps import compensate
 from tbmfg.lidar import clouds, raster
+from tbmfg.lidar.air import Air
 from tbmfg.lidar.surfels import SurfelMap
 from tbmfg.mcap import read_log
 from tbmfg.measure import gyro_frame
@@ -41,17 +44,35 @@ class Sharpness:
     voxels: int
 
 
+@dataclass(frozen=True, slots=True)
+class Map:
+    """Points (k, 3) m in n of a map with their normals, as Open3D's ``cloud``; of ``returns`` within the trajectory
+    ``in_air`` hang in the ``air`` and are not in it."""
+
+    cloud: Any
+    sharpness: Sharpness
+    returns: int
+    in_air: int
+    air: Air | None
+
+    @property
+    def points(self) -> Floats:
+        return np.asarray(self.cloud.points)
+
+
 def make(
     log_path: str,
     trajectory: str | Path,
     output: str | Path,
     *,
     lidar: str | None = None,
+    keep_air: bool = False,
     force: bool = False,
     progress: Callable[[str, float], None] | None = None,
-) -> tuple[Sharpness, int]:
+) -> Map:
     """Write the map of ``log_path`` along the result in the folder ``trajectory`` to ``output`` (.ply or .pcd), and its
-    picture beside it (.png); returns its sharpness and its number of points. Scans are read one by one."""
+    picture beside it (.png). Scans are read one by one, three times; once with ``keep_air``, which leaves nothing out.
+    """
     output, folder = Path(output), Path(trajectory)
     if output.suffix not in FORMATS:
         raise TbmfgError(f"{output}: a map ends in {' or '.join(FORMATS)}")
@@ -62,25 +83,53 @@ def make(
     log = read_log(log_path)
     rig = load_rig(folder / "rig.yaml")
     path = read_result_npz(folder / "result.npz")
+    made = mapped(partial(scans_in_n, log, rig, path, lidar), keep_air, progress)
+    if made is None:
+        raise TbmfgError(f"{log_path}: no scan lies within the trajectory of {folder}")
+    scratch = output.with_name(f".{output.stem}.part{output.suffix}")
+    open3d().io.write_point_cloud(str(scratch), made.cloud)
+    scratch.replace(output)
+    output.with_suffix(".png").write_bytes(raster.png(raster.picture(made.points, path.position_n)))
+    return made
+
+
+def mapped(
+    scans: Callable[[], Iterable[Placed]], keep_air: bool = False, progress: Callable[[str, float], None] | None = None
+) -> Map | None:
+    """The map of scans that can be read again and again; None of none."""
+
+    def told(step: str) -> Iterator[Placed]:
+        for number, scan in enumerate(scans()):
+            if progress and number % 10 == 0:
+                progress(step, scan.share)
+            yield scan
+
+    air = None if keep_air else between(told)
     o3d = open3d()
     blur, cloud, waiting = SurfelMap(THICK_M, full=np.inf), o3d.geometry.PointCloud(), []
-    for number, (share, points_n) in enumerate(scans_in_n(log, rig, path, lidar)):
-        blur.add(points_n, np.zeros(3))
-        waiting.append(points_n)
+    returns = in_air = 0
+    for scan in told("mapping"):
+        kept = scan.points if air is None else scan.points[~air.holds(scan.points)]
+        returns, in_air = returns + len(scan.points), in_air + len(scan.points) - len(kept)
+        blur.add(kept, np.zeros(3))
+        waiting.append(kept)
         if len(waiting) == MANY:
             cloud, waiting = _thinned(o3d, cloud, waiting), []
-        if progress and number % 10 == 0:
-            progress("mapping", share)
-    cloud = _thinned(o3d, cloud, waiting)
-    if not len(cloud.points):
-        raise TbmfgError(f"{log_path}: no scan lies within the trajectory of {folder}")
+    if not returns:
+        return None
+    sharp, cloud = sharpness(blur), _thinned(o3d, cloud, waiting)
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=NORMAL_M, max_nn=30))
-    scratch = output.with_name(f".{output.stem}.part{output.suffix}")
-    o3d.io.write_point_cloud(str(scratch), cloud)
-    scratch.replace(output)
-    points = np.asarray(cloud.points)
-    output.with_suffix(".png").write_bytes(raster.png(raster.picture(points, path.position_n)))
-    return sharpness(blur), len(points)
+    return Map(cloud, sharp, returns, in_air, air)
+
+
+def between(scans: Callable[[str], Iterable[Placed]]) -> Air:
+    """The air between a LiDAR and its walls, from scans that are read twice, each time for a purpose in words."""
+    air = Air()
+    for scan in scans("returns"):
+        air.add_returns(scan.points)
+    for scan in scans("rays"):
+        air.add_rays(scan.points, scan.origins)
+    return air
 
 
 def sketch(log: Log, rig: Rig, result: Result) -> tuple[Floats | None, str]:
@@ -91,8 +140,8 @@ def sketch(log: Log, rig: Rig, result: Result) -> tuple[Floats | None, str]:
         return None, ""
     every = -(-len(log.clouds[lidar.topic]) // SKETCH_SCANS)
     points_n, scans = np.zeros((0, 3)), 0
-    for _, scan in scans_in_n(log, rig, result.smoothed or result.trajectory, every=every):
-        points_n = np.vstack([points_n, scan[:: -(-len(scan) // SKETCH_POINTS)]])
+    for scan in scans_in_n(log, rig, result.smoothed or result.trajectory, every=every):
+        points_n = np.vstack([points_n, scan.points[:: -(-len(scan.points) // SKETCH_POINTS)]])
         points_n = points_n[np.unique(np.floor(points_n / SKETCH_M).astype(np.int64), axis=0, return_index=True)[1]]
         scans += 1
     if not scans:
@@ -101,11 +150,16 @@ def sketch(log: Log, rig: Rig, result: Result) -> tuple[Floats | None, str]:
     return points_n, label
 
 
-def scans_in_n(
-    log: Log, rig: Rig, path: Trajectory, name: str | None = None, every: int = 1
-) -> Iterator[tuple[float, Floats]]:
-    """Share of the log done, and the points (k, 3) in n of one LiDAR's scans, of ``every`` so many one, each
-    point from its own pose.
+class Placed(NamedTuple):
+    """A scan in n: ``points`` (k, 3) m, the LiDAR at the time of each, ``origins`` (k, 3) m; ``share`` of the log."""
+
+    share: float
+    points: Floats
+    origins: Floats
+
+
+def scans_in_n(log: Log, rig: Rig, path: Trajectory, name: str | None = None, every: int = 1) -> Iterator[Placed]:
+    """One LiDAR's scans, of ``every`` so many one, each point from its own pose.
 
     Attitude between keyframes by gyro, position by the cubic through positions and velocities.
     """
@@ -133,8 +187,9 @@ def scans_in_n(
         own_s, which = np.unique(t_s[inside], return_inverse=True)
         key = np.clip(np.searchsorted(key_s, own_s, side="right") - 1, 0, len(key_s) - 1)
         R = R_n0[key] @ frame.at(own_s)
-        body = scan.points[inside] @ sensor.T_bl.R.T + sensor.T_bl.xyz
-        yield k / len(source), (R[which] @ body[:, :, None])[:, :, 0] + track(own_s)[which]
+        origins = (R @ sensor.T_bl.xyz + track(own_s))[which]
+        way = (R @ sensor.T_bl.R)[which] @ scan.points[inside][:, :, None]
+        yield Placed(k / len(source), origins + way[:, :, 0], origins)
 
 
 def _thinned(o3d, cloud, scans: list[Floats]):

@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 
 import datasets
-from benchmarks.runs import true_states
+from benchmarks.runs import in_memory, true_states
+from datasets.lidar import raycasting
+from datasets.tbm_roadway import world
 from tbmfg import mapping
 from tbmfg.errors import TbmfgError
 from tbmfg.lidar import raster
+from tbmfg.lidar.air import Air
 from tbmfg.mcap import read_log
 from tbmfg.pipeline import run
 from tbmfg.rig import load_rig
@@ -45,12 +48,13 @@ def save(folder: Path, path: Trajectory, rig: str) -> None:
 
 def test_map_along_the_truth(made, tmp_path):
     log, folder = made
-    sharp, count = mapping.make(str(log), folder, tmp_path / "map.ply")
+    made = mapping.make(str(log), folder, tmp_path / "map.ply")
     cloud = mapping.open3d().io.read_point_cloud(str(tmp_path / "map.ply"))
     points, normals = np.asarray(cloud.points), np.asarray(cloud.normals)
-    assert len(points) == len(normals) == count > 5000
+    assert len(points) == len(normals) == len(made.points) > 5000
     # range noise is 30 mm along the ray; a wall seen at a slant is thinner
-    assert 0.01 < sharp.thickness_m < 0.04
+    assert 0.01 < made.sharpness.thickness_m < 0.04
+    assert made.in_air < 1e-3 * made.returns  # nothing hangs in clean air
     picture = (tmp_path / "map.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
     with pytest.raises(TbmfgError, match="--force"):
@@ -61,10 +65,54 @@ def test_map_along_the_estimate_is_as_sharp(made, tmp_path):
     log, folder = made
     run(str(log), estimator="batch", output=tmp_path / "batch")
     thick = [
-        mapping.make(str(log), along, tmp_path / f"{along.name}.ply")[0].thickness_m
+        mapping.make(str(log), along, tmp_path / f"{along.name}.ply").sharpness.thickness_m
         for along in (folder, tmp_path / "batch")
     ]
     assert abs(thick[1] / thick[0] - 1.0) < 0.1
+
+
+def test_dust_is_left_out_and_counted(tmp_path):
+    simulation = datasets.make(
+        "tbm-roadway", seed=3, duration=6.0, dust=0.2, dust_begin=-1.0, dust_end=2.0, columns=200, imu_rate_hz=200.0
+    )
+    log, rig, path = in_memory(simulation), simulation.rig, truth_path(simulation)
+    scans = list(mapping.scans_in_n(log, rig, path))
+    walls = raycasting(world(3))
+
+    def off(points):
+        return walls.compute_distance(points.astype(np.float32)).numpy()
+
+    made, all_of_it = mapping.mapped(lambda: scans), mapping.mapped(lambda: scans, keep_air=True)
+    far = np.concatenate([off(scan.points) for scan in scans])
+    out = np.concatenate([made.air.holds(scan.points) for scan in scans])
+    assert (made.returns, made.in_air) == (len(far), out.sum())
+    assert (all_of_it.returns, all_of_it.in_air) == (len(far), 0)
+    assert np.mean(far > 0.15) > 0.4  # beyond range noise: dust
+    assert out[far < 0.15].mean() < 1e-3
+    # the end of a ray tells nothing over 0.4 m and a tenth of its range: dust that near to a wall is not told from it
+    reach = np.concatenate([np.linalg.norm(scan.points - scan.origins, axis=1) for scan in scans])
+    assert out[(reach < 2.0) & (far > 0.5)].mean() > 0.99
+    assert out[far > 0.15].mean() > 0.9
+    assert np.mean(far[~out] > 0.15) < 0.1
+    assert np.mean(off(made.points) > 0.15) < np.mean(off(all_of_it.points) > 0.15)
+    assert made.sharpness.thickness_m < all_of_it.sharpness.thickness_m
+
+
+def test_walls_that_are_grazed_are_no_air():
+    simulation = datasets.make("tbm-tunnel", seed=1, duration=6.0, columns=200, imu_rate_hz=200.0)
+    made = mapping.mapped(lambda: mapping.scans_in_n(in_memory(simulation), simulation.rig, truth_path(simulation)))
+    assert made.in_air < 0.01 * made.returns
+
+
+def test_memory_for_the_air_goes_with_space_not_with_scans():
+    rng = np.random.default_rng(2)
+    air, points = Air(), rng.uniform(-5.0, 5.0, (3000, 3))
+    for _ in range(20):
+        air.add_returns(points)
+    air.add_rays(points, np.zeros((3000, 3)))
+    assert air.used <= 3000
+    assert len(air.keys) < 8 * 3000 + (1 << 14)
+    assert air.ended.sum() == 20 * 3000
 
 
 def test_a_result_carries_the_map(made, tmp_path):
@@ -88,8 +136,8 @@ def test_ghosts_show(made, tmp_path):
     for shift in (0.0, 0.15):
         drifting = path.position_n + shift * np.linspace(0, 1, 61)[:, None] * [0.0, 1.0, 1.0]
         blur = mapping.SurfelMap(mapping.THICK_M, full=np.inf)
-        for _, points in mapping.scans_in_n(read, rig, replace(path, position_n=drifting)):
-            blur.add(points, np.zeros(3))
+        for scan in mapping.scans_in_n(read, rig, replace(path, position_n=drifting)):
+            blur.add(scan.points, np.zeros(3))
         sharp.append(mapping.sharpness(blur))
     assert sharp[1].thickness_m > 1.3 * sharp[0].thickness_m
     assert sharp[1].entropy > sharp[0].entropy + 0.2

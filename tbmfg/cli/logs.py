@@ -70,6 +70,7 @@ def map_(
     trajectory: Annotated[str, typer.Option(metavar="DIR", help="Folder of a result of `tbmfg run`.")],
     output: Annotated[str, typer.Option("--output", "-o", metavar="FILE", help="The .ply or .pcd to write.")],
     lidar: Annotated[str | None, typer.Option(metavar="NAME", help="Which LiDAR of the rig; else the first.")] = None,
+    keep_air: Annotated[bool, typer.Option("--keep-air", help="Leave no return out, not even dust.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing map.")] = False,
 ) -> None:
     """Make the map of a log's scans along a result, and its picture.
@@ -81,12 +82,19 @@ def map_(
     from tbmfg import mapping
 
     with out.progress("mapping") as progress:
-        sharp, points = mapping.make(log, trajectory, output, lidar=lidar, force=force, progress=progress)
+        made = mapping.make(log, trajectory, output, lidar=lidar, keep_air=keep_air, force=force, progress=progress)
     picture = str(Path(output).with_suffix(".png"))
+    points, sharp = len(made.points), made.sharpness
+    if not keep_air:
+        out.say(f"{made.in_air} of {made.returns} returns ({made.in_air / made.returns:.1%}) hang in the air, as dust")
+        out.say("does: most rays through their place went on; they are left out")
     out.say(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
     out.say(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
     out.say(f"map: {output}, picture: {picture}")
-    out.data({"map": output, "picture": picture, "points": points, **asdict(sharp)})
+    out.data(
+        {"map": output, "picture": picture, "points": points, "returns": made.returns, "in_air": made.in_air}
+        | asdict(sharp)
+    )
 
 
 @command()
