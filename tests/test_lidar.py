@@ -14,7 +14,7 @@ from benchmarks.runs import in_memory, true_states
 from tbmfg.errors import LogError
 from tbmfg.estimators import estimate
 from tbmfg.evaluation.metrics import trajectory_errors
-from tbmfg.geometry import exp_so3
+from tbmfg.geometry import exp_so3, log_so3
 from tbmfg.lidar import clouds, registration
 from tbmfg.lidar.motion import Blind, Inertia, compensate
 from tbmfg.lidar.odometry import Odometry, Slides, slides, whitening
@@ -139,6 +139,24 @@ def test_a_tunnel_tells_all_but_the_way_along_it():
     assert found.overlap > 0.95
     S = whitening(found.information)
     assert np.linalg.svd(S)[1][-1] < 1e-12 * np.linalg.svd(S)[1][0]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_scan_of_a_single_plane_tells_three_directions(seed):
+    """Half a million points some hundred metres off, all on one plane of vague normal: its noise has three directions
+    that none of it lies in, and rounding of the others."""
+    rng = np.random.default_rng(seed)
+    E = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    points = rng.uniform(-40.0, 40.0, (500_000, 2)) @ E[:2] + 5.0 * E[2] + 60.0
+    planes = SurfelMap(200.0)
+    planes.add(points[:10], np.zeros(3))
+    row = np.flatnonzero(planes.moments[:, 0])
+    planes.surfels[row] = np.concatenate([points.mean(axis=0), E[2], 0.1 * E[0], 0.1 * E[1], [100.0, 1.0, 1.0]])
+    prior = (np.eye(3), np.zeros(3))
+    found = registration.align(points + 0.05 * E[2], prior, prior, planes, 1.0)
+    assert found.weak.shape[1] == 3
+    assert E[2] @ (found.p + np.cross(log_so3(found.R), points.mean(axis=0))) == pytest.approx(-0.05, abs=1e-3)
+    assert np.isfinite(found.information).all()
 
 
 def test_what_a_tunnel_hides_is_not_told_by_many_scans_either():

@@ -20,6 +20,7 @@ from tbmfg.timeseries import Floats
 
 STANDS_OUT = 3.0  # least ratio of a direction's information to what noise of the normals would give
 NEVER_TOLD = 1e-9  # noise that a direction has without any plane
+ROUNDED = 1e-12  # and as a share of all noise: matches with a single plane leave less of some than rounding does
 SIGMA_M = (0.005, 0.3)  # limits of the distances' noise
 KERNEL = 2.0  # sds at which a distance has a quarter of its weight
 ON = 0.2  # largest distance of a point on a plane, in voxels
@@ -65,6 +66,7 @@ def align(
         if len(found) < LEAST_NEAR:
             return Aligned(R, p, np.zeros((6, 6)), np.eye(6), 0.0, 0.0, SIGMA_M[1], 1.0)
         sigma = float(np.clip(1.4826 * np.median(np.abs(found)), *SIGMA_M))
+        F += ROUNDED * np.trace(F) * np.eye(6)
         ratio, V = eigh(told, F)
         weak = ratio < STANDS_OUT
         inverse = V.T @ F
