@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 from numba import njit
 
-from tbmfg.lidar.surfels import EMPTY, FEW, TILT_SD, SurfelMap, find, key_of
+from tbmfg.geometry import skew
+from tbmfg.lidar.surfels import EMPTY, FEW, TILT_SD, SurfelMap, find, key_at, key_of
 from tbmfg.timeseries import Floats
 
 Test = Literal["shape", "printed"]
@@ -81,17 +82,12 @@ def distances(points: Floats, R: Floats, p: Floats, features: Features) -> tuple
     own = points[features.of]
     reached = own @ R.T + p
     r = np.einsum("ki,ki->k", features.direction, reached - features.mean)
-    J, tilted = np.empty((len(r), 6)), np.empty((len(r), 2, 6))
-    J[:, 3:], tilted[:, :, 3:] = features.direction, features.tilts
-    J[:, :3] = _cross(own, features.direction @ R)
-    tilted[:, :, :3] = _cross(own[:, None], features.tilts @ R)
-    return r, J, tilted
+    turn = -R @ skew(own)
 
+    def along(directions: Floats) -> Floats:
+        return np.concatenate([np.einsum("k...i,kij->k...j", directions, turn), directions], axis=-1)
 
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Cross products of vectors (..., 3); numpy's own takes three times as long."""
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
+    return r, along(features.direction), along(features.tilts)
 
 
 @njit(cache=True)
@@ -189,22 +185,17 @@ def _kind(l1, l2, l3, printed):
 def _neighbours(point, voxel, keys, moments, nearest, place):
     """Put the map's points nearest to ``point`` into ``place``, their squared distances into ``nearest``, in order;
     how many there are."""
-    count, inside = 0, np.empty(3)
-    for a in range(3):
-        inside[a] = point[a] - np.floor(point[a] / voxel) * voxel
+    count = 0
+    i, j, k = int(np.floor(point[0] / voxel)), int(np.floor(point[1] / voxel)), int(np.floor(point[2] / voxel))
+    x0, y0, z0 = point[0] - i * voxel, point[1] - j * voxel, point[2] - k * voxel
     for at in range(len(AROUND)):
-        off = AROUND[at]
+        di, dj, dk = AROUND[at, 0], AROUND[at, 1], AROUND[at, 2]
         if count == NEIGHBOURS:
-            # the voxel may lie farther away than all that were found
-            least = 0.0
-            for a in range(3):
-                if off[a] != 0:
-                    side = off[a] * voxel - inside[a] if off[a] > 0 else inside[a] - (off[a] + 1) * voxel
-                    least += side * side
+            # the whole voxel may lie farther away than all that were found
+            least = _gap(x0, di, voxel) ** 2 + _gap(y0, dj, voxel) ** 2 + _gap(z0, dk, voxel) ** 2
             if least >= nearest[count - 1]:
                 continue
-        key = key_of(point[0] + off[0] * voxel, point[1] + off[1] * voxel, point[2] + off[2] * voxel, voxel)
-        row = find(key, keys)
+        row = find(key_at(i + di, j + dj, k + dk), keys)
         if keys[row] == EMPTY or moments[row, 0] < LEAST:
             continue
         share = 1.0 / moments[row, 0]
@@ -212,13 +203,21 @@ def _neighbours(point, voxel, keys, moments, nearest, place):
         d = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
         if count == NEIGHBOURS and d >= nearest[count - 1]:
             continue
-        k = min(count, NEIGHBOURS - 1)
-        while k > 0 and nearest[k - 1] > d:
-            nearest[k] = nearest[k - 1]
+        to = min(count, NEIGHBOURS - 1)
+        while to > 0 and nearest[to - 1] > d:
+            nearest[to] = nearest[to - 1]
             for a in range(3):
-                place[k, a] = place[k - 1, a]
-            k -= 1
-        nearest[k] = d
-        place[k, 0], place[k, 1], place[k, 2] = x, y, z
+                place[to, a] = place[to - 1, a]
+            to -= 1
+        nearest[to] = d
+        place[to, 0], place[to, 1], place[to, 2] = x, y, z
         count = min(count + 1, NEIGHBOURS)
     return count
+
+
+@njit(cache=True)
+def _gap(inside, steps, voxel):
+    """Distance along an axis from a point that lies ``inside`` its voxel by so much to a voxel some ``steps`` on."""
+    if steps > 0:
+        return steps * voxel - inside
+    return inside - (steps + 1) * voxel if steps < 0 else 0.0

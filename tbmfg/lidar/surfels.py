@@ -69,7 +69,12 @@ class SurfelMap:
 @njit(cache=True)
 def key_of(x, y, z, voxel):
     """Integer key of the voxel that holds a point: 21 bits an axis."""
-    i, j, k = int(np.floor(x / voxel)), int(np.floor(y / voxel)), int(np.floor(z / voxel))
+    return key_at(int(np.floor(x / voxel)), int(np.floor(y / voxel)), int(np.floor(z / voxel)))
+
+
+@njit(cache=True)
+def key_at(i, j, k):
+    """Key of the voxel that is the i-th, j-th and k-th along the axes."""
     return ((np.int64(i) & 0x1FFFFF) << 42) | ((np.int64(j) & 0x1FFFFF) << 21) | (np.int64(k) & 0x1FFFFF)
 
 
