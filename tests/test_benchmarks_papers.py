@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import datasets
 from benchmarks.__main__ import main
@@ -238,12 +239,31 @@ def test_the_pump_turns_the_heading_of_a_mean_and_not_of_a_rotation():
 
 def test_the_roadheaders_drives_are_measured():
     """On a drive without its LiDAR, which takes longer than all else."""
-    methods = tuple(method for method in tbm_drives.METHODS if method.estimator in ("tbm-ins-ts", "ins"))
-    trial = Trial("dust", "tbm-drive", 0, 12.0, methods, tbm_drives.errors, options={"imu_rate_hz": 100.0})
+    methods = tuple(method for method in tbm_drives.METHODS if method.estimator in ("tbm-ins-ts", "ins", "batch"))
+    options = {"imu_rate_hz": 100.0}
+    trial = Trial("dust", "tbm-drive", 0, 12.0, methods, tbm_drives.errors, options=options, least=tbm_drives.least)
     rows = {row.key: row for row in Outcomes(run(trial)).rows("dust", {}, {})}
+    # the arm alone is known to 5 mm an axis; and one log is one draw of it
+    bound = rows["dust", "batch", "position_rms_bound"].mean
+    assert 0.005 < bound < 0.012
+    assert rows["dust", "batch", "position_rms"].mean < bound * np.sqrt(chi2.ppf(0.9999, 3) / 3)
+    assert ("dust", "ins", "position_rms_bound") not in rows
     assert rows["dust", "tbm-ins-ts", "failed"].mean == 0
     assert 0 < rows["dust", "tbm-ins-ts", "position_rms"].mean < 0.1
     assert rows["dust", "ins", "over 0.3 m"].mean == 0
+
+
+def test_the_smoother_is_held_to_half_of_the_best_filter_or_to_what_the_log_can_tell():
+    def rows(batch, bound, best):
+        found = [outcome("dust", "batch", "hidden_rms", batch), outcome("dust", "batch", "hidden_rms_bound", bound)]
+        found += [
+            outcome("dust", name, "hidden_rms", best * (2 - (name == tbm_drives.STAR))) for name in tbm_drives.FILTERS
+        ]
+        over_bound, over_best = tbm_drives.over_best_filter(Outcomes(found), "dust")
+        return over_bound.mean, over_best.mean, over_best.bound[1]
+
+    assert rows(0.03, 0.02, 0.1) == pytest.approx((1.5, 0.3, 0.5))
+    assert rows(0.009, 0.0086, 0.01) == pytest.approx((0.009 / 0.0086, 0.9, 1.1 * 0.86))
 
 
 def outcome(scenario, method, metric, value):

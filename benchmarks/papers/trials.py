@@ -17,7 +17,7 @@ from tbmfg.errors import TbmfgError
 if TYPE_CHECKING:
     from datasets.simulate import Simulation
     from tbmfg.rig import Rig
-    from tbmfg.state import Result, Truth
+    from tbmfg.state import Result, Trajectory, Truth
 
 Metrics = dict[str, tuple[float, str]]  # name -> value and unit
 
@@ -41,8 +41,9 @@ class Trial:
     """One log to simulate, ``settings`` and ``options`` as :func:`datasets.make` takes them, and who estimates it.
 
     ``metrics`` measures a result against the truth at its keyframes; ``rig`` says with the seed what the estimators are
-    told, where that is not just the log's own rig; ``between`` measures the results against each other, by label. All
-    are functions of a module, so that another process finds them.
+    told, where that is not just the log's own rig; ``between`` measures the results against each other, by label;
+    ``least`` measures the Cramer-Rao bound of smoothing, for the methods that know the whole log. All are
+    functions of a module, so that another process finds them.
     """
 
     scenario: str
@@ -55,6 +56,7 @@ class Trial:
     options: dict[str, Any] = field(default_factory=dict)
     rig: Callable[[Simulation, int], Rig] | None = None
     between: Callable[[dict[str, Result]], dict[str, Metrics]] | None = None
+    least: Callable[[Simulation, Trajectory], Metrics] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,8 @@ class Outcome:
 def run(trial: Trial) -> list[Outcome]:
     """Simulate, prepare once, estimate with each method, measure."""
     import datasets
-    from tbmfg.estimators import estimate
+    from tbmfg.bounds import cramer_rao
+    from tbmfg.estimators import ESTIMATORS, estimate
     from tbmfg.prepare import prepare
     from tbmfg.rig import override
 
@@ -93,8 +96,12 @@ def run(trial: Trial) -> list[Outcome]:
             results[method.label] = result
         except TbmfgError as error:
             outcomes.append(Outcome(trial.scenario, method.label, trial.seed, {}, failure=str(error)))
-    between = trial.between(results) if trial.between is not None else {}
-    return [replace(one, metrics=one.metrics | between.get(one.method, {})) for one in outcomes]
+    extra = trial.between(results) if trial.between is not None else {}
+    whole = [method.label for method in trial.methods if ESTIMATORS[method.estimator].whole and method.label in results]
+    if trial.least is not None and whole:
+        bound = cramer_rao(problem, true_states(simulation, problem.t_ns)).smoothing
+        extra |= {label: extra.get(label, {}) | trial.least(simulation, bound) for label in whole}
+    return [replace(one, metrics=one.metrics | extra.get(one.method, {})) for one in outcomes]
 
 
 def _measured(trial: Trial, label: str, simulation: Simulation, result: Result, duration_s: float) -> Outcome:
