@@ -243,6 +243,18 @@ def test_bad_scans_are_survived():
     assert np.isfinite(last.root).all()
 
 
+def test_long_in_dust_the_attitude_stays_a_rotation():
+    """What a long sum of gyro steps has of rounding must not grow with every scan that is merely predicted."""
+    rng, t_s = np.random.default_rng(11), np.arange(0.0, 20.0, 0.05)
+    R_0b = exp_so3(np.array([0.01, 0.02, 0.1]) * t_s[:, None]) * (1 + 1e-12)
+    odometry = Odometry(SENSOR, Inertia(t_s, R_0b, None, np.eye(3), np.zeros(3)))
+    for k in range(150):
+        dust = rng.uniform(-3.0, 3.0, (120, 3))
+        pose = odometry.register(clouds.Scan(0, dust, None, 0, 0, 0), 0.1 * k)
+    assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-11)
+    assert_allclose(pose.R, exp_so3(np.array([0.01, 0.02, 0.1]) * 14.9), atol=0.05)
+
+
 # ---- in the graph ----
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tbmfg.geometry import log_so3, rotation_z
+from tbmfg.geometry import exp_so3, log_so3, rotation_z
 from tbmfg.lidar import registration
 from tbmfg.lidar.clouds import Scan
 from tbmfg.lidar.motion import Blind, Inertia, compensate
@@ -172,7 +172,8 @@ class Odometry:
     def _predicted(self, t_s: float) -> tuple[Floats, Floats]:
         """The last pose, moved on."""
         R, p = self.motion.poses(np.array([self.last.t_s, t_s]), self.velocity_0, self.rate_l)
-        turn, shift = R[0].T @ R[1], R[0].T @ (p[1] - p[0])
+        # by the angle: products would keep the rounding of long sums, and KISS-ICP ends the process at 1e-10 of it
+        turn, shift = exp_so3(log_so3(R[0].T @ R[1])), R[0].T @ (p[1] - p[0])
         return self.last.R @ turn, self.last.p + self.last.R @ shift
 
     def _align(
