@@ -1,5 +1,6 @@
 """LiDAR odometry by the scans alone, beside the libraries, on a recording (BALM, KITTI; recordings not part of this).
 
+GenZ-ICP is among them where it is installed (pip install genz-icp).
 Every method takes the same scans in the same order, with its own constant-velocity guess. Medians over the repetitions:
 
 lost       first scan whose pose is more than 0.3 m or 5 degrees from the reference, the number of scans for none
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +60,8 @@ def methods() -> dict[str, Callable[[], Register]]:
     for voxel in VOXELS_M:
         found[f"KISS-ICP {voxel}"] = lambda voxel=voxel: _kiss(voxel)
         found[f"small_gicp {voxel}"] = lambda voxel=voxel: _gicp(voxel)
+        if find_spec("genz_icp"):
+            found[f"GenZ-ICP {voxel}"] = lambda voxel=voxel: _genz(voxel)
     return found
 
 
@@ -86,6 +90,21 @@ def _kiss(voxel: float) -> Register:
     def register(points: Floats, t_s: float) -> tuple[Floats, bool]:
         kiss.register_frame(points, np.zeros(0))  # no times: no compensation
         return kiss.last_pose.copy(), False
+
+    return register
+
+
+def _genz(voxel: float) -> Register:
+    from genz_icp.config import load_config
+    from genz_icp.genz_icp import GenZICP
+
+    config = load_config(None)
+    config.mapping.voxel_size = voxel
+    genz = GenZICP(config)
+
+    def register(points: Floats, t_s: float) -> tuple[Floats, bool]:
+        genz.register_frame(points, None)
+        return genz.last_pose.copy(), False
 
     return register
 

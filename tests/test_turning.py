@@ -15,20 +15,23 @@ SIGMA = 5e-4  # rad, of a pose
 DT = 0.005
 
 
-def frame_of(axes=(0.5, 0.3, 0.8), end_s=60.0):
-    """Turning to and fro about three axes at different rates."""
+def frame_of(axes=(0.5, 0.3, 0.8), end_s=60.0, standing_s=0.0):
+    """Turning to and fro about three axes at different rates, after standing."""
     edges = np.arange(0.0, end_s + DT / 2, DT)
     middle = edges[:-1] + DT / 2
     rate = np.stack([a * np.cos(w * middle) for a, w in zip(axes, (1.1, 0.7, 0.4), strict=True)], axis=1)
+    rate[middle < standing_s] = 0.0
     none = np.zeros(len(middle))
     steps = Steps(0, edges, rate, np.zeros_like(rate), none, none, DT, ())
     return gyro_frame(steps, rate, np.zeros(3))
 
 
-def poses_of(frame, R_bl, late_s, seed=0, told=True):
+def poses_of(frame, R_bl, late_s, seed=0, told=True, loud_s=0.0, loud=1.0):
+    """Noise is ``loud`` times what the roots tell from ``loud_s`` on."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.5, frame.steps.edges_s[-1] - 0.5, 0.1)
-    R = frame.at(t) @ R_bl @ exp_so3(SIGMA * rng.standard_normal((len(t), 3)))
+    sigma = SIGMA * np.where(t < loud_s, 1.0, loud)[:, None]
+    R = frame.at(t) @ R_bl @ exp_so3(sigma * rng.standard_normal((len(t), 3)))
     root = np.diag([1 / SIGMA] * 3 + [1e3] * 3) * told
     values = np.hstack([R.reshape(-1, 9), np.zeros((len(t), 3)), np.tile(root.ravel(), (len(t), 1))])
     return Samples("lidar", t + late_s, values)
@@ -73,6 +76,23 @@ def test_turns_about_one_axis_leave_the_mounting_about_it_open():
     assert found.turn_sd[2] > 1.0
     assert found.turn_sd[:2].max() < np.deg2rad(0.3)
     assert contradictions("lidar", lidar(), found) == []
+
+
+def test_scans_that_agree_better_while_it_stands_are_no_measure_of_turns():
+    scores, lines = [], []
+    for seed in range(10):
+        frame = frame_of(axes=(0.0015, 0.001, 0.0024), end_s=120.0, standing_s=96.0)
+        found = against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0, seed, loud_s=96.0, loud=10.0), frame)
+        scores.append(np.append(found.turn / found.turn_sd, found.late_s / found.late_sd))
+        lines += contradictions("lidar", lidar(), found)
+    # 40 squares, 1 expected of each: chi-square of 40 in 1 of 10^4 cases beyond 82
+    assert np.sum(np.square(scores)) < 82.0
+    assert lines == []
+
+
+def test_a_log_that_hardly_turns_tells_nothing():
+    frame = frame_of(end_s=60.0, standing_s=56.0)
+    assert against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0), frame) is None
 
 
 def test_nothing_told_is_nothing_found():

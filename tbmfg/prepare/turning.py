@@ -16,7 +16,7 @@ from tbmfg.state import Calibrated
 from tbmfg.timeseries import Floats
 
 SPAN_S = 1.0  # over which turns are compared, and averaged
-LEAST = 10  # such spans
+LEAST = 10  # such spans: of equal turns, or of unequal ones as many as their squares make
 ITERATIONS = 20
 STILL = 1e-6  # rad and s
 BOUND = 3.0  # times the usual residual from which a span loses weight
@@ -39,7 +39,8 @@ class Turning:
 
 
 def against_gyro(sensor: Lidar, poses: Samples, frame: GyroFrame) -> Turning | None:
-    """Mounting and clock by the turns alone, least squares with the gyro's bias; None where too few poses tell theirs.
+    """Mounting and clock by the turns alone, least squares with the gyro's bias; None where too few spans turn, or too
+    few poses tell theirs. The usual residual is that of the spans that turn: while it stands, scans agree better.
 
     ``poses`` as :func:`tbmfg.prepare.scans.register` makes them. What no turn shows has a large sd. The gyro has
     carried the points within each scan: what vibrates agrees with it whatever the clock, and is averaged out.
@@ -59,6 +60,9 @@ def against_gyro(sensor: Lidar, poses: Samples, frame: GyroFrame) -> Turning | N
     start_s, end_s = poses.t_s[first], poses.t_s[last]
     W = averaged(_of_rotation(roots[last]))
     seen = averaged(log_so3(R[first].swapaxes(1, 2) @ R[last]))
+    turns = np.sum(averaged(_turned(frame, start_s, end_s)) ** 2, axis=1)
+    if turns.sum() ** 2 < LEAST * (turns @ turns):
+        return None
     faster_b, dt = averaged(frame.rate(end_s) - frame.rate(start_s)), averaged(end_s - start_s)[:, None, None]
     ways = [sensor.T_bl.R, _roughly(sensor.T_bl.R, averaged(_turned(frame, start_s, end_s)), seen)]
 
@@ -71,7 +75,7 @@ def against_gyro(sensor: Lidar, poses: Samples, frame: GyroFrame) -> Turning | N
             A = W @ np.concatenate([skew(own), -(faster_b @ R_bl)[:, :, None], bias], axis=2)
             r = (W @ (seen - own)[:, :, None])[:, :, 0]
             size = np.linalg.norm(r, axis=1)
-            usual = max(np.median(size) / 1.54, 1.0)  # the median of a chi of three
+            usual = max(_median(size, turns) / 1.54, 1.0)  # the median of a chi of three
             weight = np.minimum(1.0, BOUND * usual / np.maximum(size, 1e-12)) / usual**2
             cov = np.linalg.inv(np.einsum("n,nki,nkj->ij", weight, A, A) + np.diag(WIDE**-2.0))
             step = cov @ np.einsum("n,nki,nk->i", weight, A, r)
@@ -83,6 +87,12 @@ def against_gyro(sensor: Lidar, poses: Samples, frame: GyroFrame) -> Turning | N
     _, R_bl, late_s, cov = min((solved(way) for way in ways), key=lambda one: one[0])
     sd = np.sqrt(np.diag(cov))
     return Turning(log_so3(sensor.T_bl.R.T @ R_bl), sd[:3], late_s, float(sd[3]))
+
+
+def _median(values: Floats, weights: Floats) -> float:
+    """The value with half of the weight on either side."""
+    order = np.argsort(values)
+    return float(values[order][np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())])
 
 
 def _turned(frame: GyroFrame, first_s: Floats, last_s: Floats) -> Floats:
