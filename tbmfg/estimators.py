@@ -45,12 +45,17 @@ def ins(problem: Problem, progress: Progress) -> Result:
 
     f = filter_.run(problem, fixed=CLOCK, progress=progress)
     out = result(problem, "ins", f.x, f.cov, f.c, f.c_cov, f.nis, f.gated)
-    out.warnings += [
-        f"{sensor}: after {filter_.REOPEN} rejections in a row the gate was opened, {times} in all"
-        for sensor, times in f.reopened.items()
+    out.warnings += _opened(f.reopened, filter_.REOPEN)
+    return out
+
+
+def _opened(reopened: dict[str, int], after: int) -> list[str]:
+    """How often a filter believed a sensor again that contradicted it."""
+    return [
+        f"{sensor}: after {after} rejections in a row the gate was opened, {times} in all"
+        for sensor, times in reopened.items()
         if times
     ]
-    return out
 
 
 def batch(problem: Problem, progress: Progress) -> Result:
@@ -162,7 +167,9 @@ def _ins_ts(problem: Problem, progress: Progress) -> tuple[Result, tbm.Filtered]
     seen = tbm.view(problem, options)
     f = tbm.run(seen, options, progress)
     edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
-    return result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns), f
+    out = result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
+    out.warnings += _opened(f.reopened, tbm.REOPEN)
+    return out, f
 
 
 def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
@@ -171,6 +178,7 @@ def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
 
     import numpy as np
 
+    from tbmfg.filters import tbm
     from tbmfg.outcome import beyond_gate, result, ungated
     from tbmfg.smoother import rrr
 
@@ -187,6 +195,7 @@ def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
         out.innovations[prism], out.counts[prism] = ins_ts.innovations[prism], ins_ts.counts[prism]
     out.calibration = ins_ts.calibration
     out.warnings += [
+        *_opened(f.reopened, tbm.REOPEN),
         *ungated(beyond_gate(seen, fused.nis)),
         f"{name} takes every state of tbm-ins-ts for an independent prior, though they share their fixes: its "
         "covariance is too small",

@@ -284,6 +284,54 @@ def test_a_prism_that_contradicts_the_map_for_long_is_believed_again():
     assert_allclose(end, [0.0, 0.5, 0.0], atol=0.03)
 
 
+def moving(since_s):
+    """The log from then on, when the machine moves: the rig's start is wrong in place and speed."""
+    t_ns = simulation().start_ns + round(since_s * 1e9)
+    series = {topic: own.select(own.t_ns >= t_ns) for topic, own in log().series.items()}
+    clouds = {}
+    for topic, own in log().clouds.items():
+        kept = tuple(scan for scan in own.scans if scan[0] >= t_ns)
+        clouds[topic] = replace(own, t_ns=np.array([stamp for stamp, _ in kept]), scans=kept)
+    return replace(log(), series=series, clouds=clouds)
+
+
+@pytest.mark.parametrize("name", ["tbm-ins-ts", "tbm-mse", "tbm-rrr-mf"])
+def test_a_start_in_motion_is_found_by_the_fixes(name):
+    found = estimate(name, prepare(moving(6.0), simulation().rig))
+    end = trajectory_errors(found.trajectory, true_states(simulation(), found.trajectory.t_ns)).position_n[-1]
+    assert np.linalg.norm(end) < 0.03
+    assert found.counts["prism"].gated >= 10
+    assert any("10 rejections in a row" in line or "10 fixes of the prism in a row" in line for line in found.warnings)
+
+
+@pytest.mark.parametrize("name", [*ALL, "tbm-rrr-mf"])
+def test_a_prism_lost_for_most_of_the_log_is_counted(name):
+    lost = prepare(log(), simulation().rig, outages=(("prism", 4.0, 14.0),))
+    found = estimate(name, lost)
+    assert found.counts["prism"].outage == 50
+    errors = trajectory_errors(found.trajectory, true_states(simulation(), found.trajectory.t_ns))
+    assert np.linalg.norm(errors.position_n, axis=1).max() < 0.15
+    assert errors.nees[-1] < 2 * chi2.ppf(
+        0.999, 6
+    )  # a prism that contradicts the map by its drift is gated for a while
+
+
+def test_an_imu_at_the_end_of_its_scale_is_said():
+    topic = simulation().rig.imu.topic
+    imu = log().series[topic]
+    size = np.abs(imu["acc"][:, :2]).max(axis=0)
+    acc = imu["acc"].copy()
+    acc[:, :2] = np.clip(acc[:, :2], -0.5 * size, 0.5 * size)
+    own = replace(log(), series=log().series | {topic: replace(imu, columns=imu.columns | {"acc": acc})})
+    struck = prepare(own, simulation().rig)
+    assert any("imu: acc x is at the end of its scale" in line for line in struck.warnings)
+    assert not any("end of its scale" in line for line in problem().warnings)
+    for name in ("tbm-ins-ts", "tbm-lins"):
+        found = estimate(name, struck)
+        errors = trajectory_errors(found.trajectory, true_states(simulation(), found.trajectory.t_ns))
+        assert np.linalg.norm(errors.position_n, axis=1).max() < 0.15
+
+
 def test_what_they_need():
     prism_only = prepare(log(), simulation().rig, without=("lidar",))
     assert unmet("tbm-mse", prism_only) == "needs lidar"

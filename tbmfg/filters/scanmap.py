@@ -196,12 +196,9 @@ class ScanMap:
         """Take what another sensor's correction says of the map's pose."""
         self.pose = moved(self.pose, dx[-CLONE:])
 
-    def forsaken(self, P: Floats, off: Floats) -> Floats:
-        """The covariance for a position that the map had ``off`` by that much [m]; the next scan begins a new one."""
+    def forsake(self) -> None:
+        """Give the map up; the next scan begins a new one."""
         self.map, self.given_up = None, self.given_up + 1
-        P = P.copy()
-        P[POS, POS] += np.eye(3) * (off @ off)
-        return P
 
     def _told(self, points: Floats, R: Floats, p: Floats, found: Features) -> tuple[Floats, Floats] | None:
         """What a scan says of the body's pose on the map: the square root S (6, 6) of its information D' R^-1 D, and by

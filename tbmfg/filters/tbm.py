@@ -29,10 +29,10 @@ from tbmfg.measure import gyro_frame, position_rows
 from tbmfg.problem import GATE, Parameters, Problem
 from tbmfg.rig import Imu, kind_of
 from tbmfg.sensors import Rows
-from tbmfg.state import BA, BG, NAV
+from tbmfg.state import BA, BG, NAV, POS
 from tbmfg.timeseries import Floats
 
-REOPEN = 10  # fixes gated in a row after which the map that contradicts them is given up
+REOPEN = 10  # fixes gated in a row after which it is the state that is wrong, and the map if there is one
 LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
 
 
@@ -52,7 +52,7 @@ class InsTs(Node):
 @dataclass(frozen=True, slots=True)
 class Filtered:
     """States (n, 21) and covariances (n, 15, 15) at the keyframes, calibrations (m,) with covariance (m, m) at the end,
-    NIS and gate flags by sensor and row."""
+    NIS and gate flags by sensor and row, and how often each sensor's gate was opened."""
 
     x: Floats
     cov: Floats
@@ -60,6 +60,7 @@ class Filtered:
     c_cov: Floats
     nis: dict[str, Floats]
     gated: dict[str, np.ndarray]
+    reopened: dict[str, int]
 
 
 def view(problem: Problem, switches: InsTs, kinds: tuple[str, ...] = ("prism",)) -> Problem:
@@ -100,7 +101,8 @@ def run(
     predicted = Prediction(problem, switches.tau_s)
     nis = {rows.sensor: np.full(len(rows), np.nan) for rows in problem.rows}
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
-    in_a_row, gates = dict.fromkeys(nis, 0), {rows.sensor: chi_square_point(GATE, rows.dof) for rows in problem.rows}
+    in_a_row, reopened = dict.fromkeys(nis, 0), dict.fromkeys(nis, 0)
+    gates = {rows.sensor: chi_square_point(GATE, rows.dof) for rows in problem.rows}
     epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows] or [keyframes]))
     due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
     for rows in problem.rows:
@@ -123,10 +125,15 @@ def run(
             nis[rows.sensor][r] = innovation(P, H, residual)[0]
             in_a_row[rows.sensor] += 1
             if nis[rows.sensor][r] > gates[rows.sensor]:
-                if scans is None or in_a_row[rows.sensor] <= REOPEN:
+                if in_a_row[rows.sensor] <= REOPEN:
                     gated[rows.sensor][r] = True
                     continue
-                P = scans.forsaken(P, residual * rows.sigma[r])
+                reopened[rows.sensor] += 1
+                off = residual * rows.sigma[r]
+                P = P.copy()
+                P[POS, POS] += np.eye(3) * (off @ off)
+                if scans is not None:
+                    scans.forsake()
             in_a_row[rows.sensor] = 0
             dx, P = correct(P, H, residual)  # (23)-(25)
             x = correct_state(x, dx[:NAV])  # (26)
@@ -142,7 +149,7 @@ def run(
             progress(number / len(epochs))
     c_cov = np.zeros((len(c), len(c)))
     c_cov[np.ix_(free, free)] = P[NAV:own, NAV:own]
-    return Filtered(np.array(xs), np.array(covs), c, c_cov, nis, gated)
+    return Filtered(np.array(xs), np.array(covs), c, c_cov, nis, gated, reopened)
 
 
 class Prediction:

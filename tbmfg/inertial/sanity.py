@@ -17,6 +17,7 @@ ASTRAY = np.deg2rad(30.0)  # gravity is not where the gyro says
 BETTER = 3.0  # times smaller must the angle be in another unit
 POSSIBLE = {"gyro": 200.0, "acc": 1e4}  # rad/s, m/s^2: no IMU measures more; a reading beyond is a broken message
 STUCK = 10  # samples in a row that are equal in all six axes
+PILE, RUN = 3, 3  # times as many samples at the end of a scale as at the next value inside, and how many in a row
 
 
 def fault(steps: Steps) -> str | None:
@@ -63,6 +64,22 @@ def stuck(imu: Series) -> list[tuple[int, int]]:
         same &= (np.diff(imu[column], axis=0) == 0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= STUCK]
+
+
+def saturated(imu: Series) -> list[tuple[str, float, NDArray[np.bool_]]]:
+    """Axes that reach an end of their scale: name, its value [SI], and which samples (n,) lie there. Noise thins out
+    towards its largest values, a limit is where readings pile up."""
+    found = []
+    for column in POSSIBLE:
+        for name, values in zip("xyz", imu[column].T, strict=True):
+            for end in (values.max(), values.min()):
+                at = values == end
+                inside = np.abs(values[~at] - end)
+                if at.sum() < STUCK or not len(inside) or at.sum() < PILE * np.sum(inside == inside.min()):
+                    continue
+                if np.convolve(at, np.ones(RUN), "valid").max() >= RUN:
+                    found.append((f"{column} {name}", float(end), at))
+    return found
 
 
 def gravity_astray(steps: Steps, scale: float) -> float:

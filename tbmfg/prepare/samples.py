@@ -78,6 +78,13 @@ def imu_steps(
         )
         if len(series) < LEAST_IMU:
             raise LogError(f"{log.path}: {topic}: {warnings[-1]}, and {len(series)} samples remain; check the IMU")
+    for axis, end, at in sanity.saturated(series):
+        first = float(seconds(series.t_ns, int(series.t_ns[0]))[np.argmax(at)])
+        unit = "rad/s" if axis.startswith("gyro") else "m/s^2"
+        warnings.append(
+            f"imu: {axis} is at the end of its scale, {end:.4g} {unit}, in {at.sum()} of {len(series)} samples, the "
+            f"first at {first:.1f} s: what it felt beyond is lost, and the sds do not know of it"
+        )
     steps = make_steps(series, rig.imu.T_bi.R, rig.imu.stamp)
     counts = Counts(
         received=c.received,
