@@ -17,7 +17,8 @@ Cramer-Rao bound leaves a smoother; ``.. over best filter`` is to be half where 
 
 ``shaken start``, ``shaken start, enhanced``: Figs. 14 and 15. The same logs with and without inertial enhancement of
 all estimators, from an unknown heading; ``tbm-mse`` has it in both, ``tbm-mse-star`` in none. ``initial_yaw`` is the
-error of what an estimator starts from.
+error of what an estimator starts from. Enhancement need not help: without prism and walls the tilt by gravity takes
+changes of speed for tilt, see ``tbm-mse`` in docs/estimators.md.
 """
 
 from __future__ import annotations
