@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import multivariate_normal
 
-from tbmfg.filters.kalman import correct, innovation, innovation_noise, predict
+from tbmfg.filters.kalman import correct, explaining, innovation, innovation_noise, predict
 from tests.problems import EPS
 
 
@@ -45,6 +45,17 @@ def test_a_given_noise_is_that_of_whitened_rows():
     white = np.linalg.inv(np.linalg.cholesky(R))
     for given, whitened in zip(correct(P, H, r, R), correct(P, white @ H, white @ r), strict=True):
         assert_allclose(given, whitened, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("k", [1, 3, 6])
+def test_a_state_that_explains_an_innovation_is_wider_along_one_error(k):
+    P, H, r = problem(3, k=k)
+    r *= 100.0
+    wider = explaining(P, H, r, innovation(P, H, r)[0])
+    assert innovation(wider, H, r)[0] == pytest.approx(k, rel=1e-9)
+    assert np.sum(np.linalg.eigvalsh(wider - P) > 1e-9 * np.trace(wider)) == 1
+    # the correction of a widened state meets the row but for its noise
+    assert np.linalg.norm(r + H @ correct(wider, H, r)[0]) < 0.01 * np.linalg.norm(r)
 
 
 def test_prediction_moves_the_first_states_only():

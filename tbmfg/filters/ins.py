@@ -15,15 +15,15 @@ import numpy as np
 from numba import njit
 
 from tbmfg.chance import chi_square_point
-from tbmfg.filters.kalman import correct, innovation, predict
+from tbmfg.filters.kalman import correct, explaining, innovation, predict
 from tbmfg.inertial.strapdown import correct_state, difference, propagate
 from tbmfg.problem import GATE, Problem
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
-# Rows of one sensor gated in a row after which the next is let in: then the state is wrong, not the sensor. A sensor
-# whose loss is gnc may be biased for long, and stays out until it agrees again.
+# Rows of one sensor gated in a row after which the next is let in: then the state is wrong, not the sensor, and its
+# covariance is to say so. A sensor whose loss is gnc may be biased for long, and stays out until it agrees again.
 REOPEN = 10
 TAIL = (
     4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it
@@ -94,19 +94,18 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
                 binary = rows.i[r] < k
                 before = previous if binary else x
                 parts = rows.evaluate_at(before[None], x[None], c, slice(r, r + 1))
-                shut = gates[sensor] if in_a_row[sensor] < REOPEN or rows.loss == "gnc" else np.inf
+                shut, open_ = gates[sensor], in_a_row[sensor] >= REOPEN and rows.loss != "gnc"
                 prior = x.copy(), previous.copy(), P, c.copy()
-                P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut)
+                P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut, open_)
                 if logdet > WIDE and value <= shut:
                     P = _iterate(rows, r, binary, *prior, x, previous, c, free, inputs[sensor])
                 nis[sensor][r] = value
                 cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
-                if value > shut:
+                if value > shut and not open_:
                     gated[sensor][r] = True
                     in_a_row[sensor] += 1
                     continue
-                if in_a_row[sensor] >= REOPEN:
-                    reopened[sensor] += 1
+                reopened[sensor] += int(value > shut)
                 in_a_row[sensor] = 0
         xs[k], covs[k] = x, P[:d, :d]
         if progress is not None and k % 500 == 0:
@@ -153,16 +152,19 @@ def _iterate(
 
 
 @njit(cache=True)
-def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate):
+def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate, open_):
     """Correct the state ``x``, the ``previous`` keyframe's pose and the constants ``c``, in place, by one row that was
-    linearised there, unless its squared normalised innovation is beyond ``gate``: covariance, that innovation, and log
-    det S."""
+    linearised there: covariance, its squared normalised innovation, and log det S. One beyond the ``gate`` is left
+    out, or, where the gate is ``open_``, explained by a wider covariance."""
     r, H = residual[0], _jacobian(P, Ji, Jj, Jc, places)
     nis, logdet = innovation(P, H, r)
-    if not nis > gate:
-        dx, P = correct(P, H, r)
-        _move(x, previous, c, dx, free)
-    return P, nis, logdet
+    if nis > gate and not open_:
+        return P, nis, logdet
+    dx, P1 = correct(explaining(P, H, r, nis) if nis > gate else P, H, r)
+    if nis > gate:
+        P1 += np.outer(dx, dx)  # or else it is the sensor that is wrong, and the state is where it was
+    _move(x, previous, c, dx, free)
+    return P1, nis, logdet
 
 
 @njit(cache=True)

@@ -44,6 +44,18 @@ def correct(P, H, r, R=None):
 
 
 @njit(cache=True)
+def explaining(P, H, r, nis):
+    """Covariance of a state that is to explain the innovation ``r`` (k,), whose square is ``nis`` > k: widened along
+    the likeliest error that would, u = P H^T (H P H^T)^-1 r with H u = r, and as far as makes that square k, its mean.
+
+    With P + b u u^T the innovation spreads by S + b r r^T, and its square is nis / (1 + b nis).
+    """
+    PHt = P @ H.T
+    u = PHt @ (np.linalg.pinv(H @ PHt) @ r)
+    return P + (1.0 / len(r) - 1.0 / nis) * np.outer(u, u)
+
+
+@njit(cache=True)
 def innovation_noise(residuals, HPHt, floor):
     """Noise of rows by what their innovations leave after the state's doubt: R = C - H P H^T, (k, k).
 
