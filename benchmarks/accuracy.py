@@ -46,11 +46,24 @@ SCENARIOS = {
     "tbm-drive": ("tbm-drive", ()),
     # every error a draw from the estimators' model
     "tbm-drive-nominal": ("tbm-drive", ("vibration=0", "slide=1", "sensors.imu.noise_factor=1")),
+    # the same, of a machine whose sensors were bolted on without measuring
+    "tbm-drive-unknown": (
+        "tbm-drive",
+        (
+            "vibration=0",
+            "slide=1",
+            "sensors.imu.noise_factor=1",
+            "sensors.prism.clock_offset_sd_s=0.02",
+            "sensors.prism.clock_drift_sd_ppm=10",
+            "sensors.odometer.mounting_sd_deg=0.5",
+            "sensors.magnetometer.declination_sd_deg=2",
+        ),
+    ),
     "shearer-cut": ("shearer-cut", ()),
     "shaft-dynamic-nominal": ("shaft-dynamic", ("nominal=1", "sensors.imu.noise_factor=1")),
     "shaft-descend-nominal": ("shaft-descend", ("nominal=1", "sensors.imu.noise_factor=1")),
 }
-NOMINAL = ("tbm-drive-nominal", "shearer-cut", "shaft-descend-nominal")
+NOMINAL = ("tbm-drive-nominal", "tbm-drive-unknown", "shearer-cut", "shaft-descend-nominal")
 LIMITS = {"batch": 1.05, "ins": 1.15}  # of errors over their bounds
 JUDGED = ("position", "attitude")
 CONFIDENCE = 1.645  # standard errors below the mean that 95 % lie above

@@ -32,6 +32,9 @@ DRAWN = {
     "clock_offset_s": ("clock_offset_s", 1.0),
     "clock_drift_ppm": ("clock_drift_ppm", 1.0),
     "scale": ("scale", 1.0),
+    "yaw_pitch_deg": ("mounting_yaw_pitch_deg", 1.0),
+    "declination_deg": ("declination_deg", 1.0),
+    "lapse_kpkm": ("lapse_kpkm", 1.0),
     "hard_iron_ut": ("hard_iron_ut", 1.0),
     "tilt_n": ("tilt_deg", np.rad2deg(1.0)),
     "zero_m": ("offset_m", 1.0),
@@ -235,7 +238,7 @@ def calibration_z(simulation: Simulation, result: Result) -> dict[str, float]:
             found = result.calibration.get(f"{sensor}_{name}")
             if drawn_name not in drawn or found is None or not found.estimated:
                 continue
-            scores = np.atleast_1d((np.array(found.value) - unit * drawn[drawn_name]) / np.array(found.sd))
+            scores = np.atleast_1d((np.array(found.value) - unit * np.array(drawn[drawn_name])) / np.array(found.sd))
             labels = [f"_{axis}" for axis in "xyz"[: len(scores)]] if len(scores) > 1 else [""]
             z |= {
                 f"{sensor}_{drawn_name.removesuffix('_m')}{label}": float(s)

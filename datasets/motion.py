@@ -6,7 +6,7 @@ Nothing here is shared with the package under test: rotations are written out be
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
@@ -89,24 +89,32 @@ def lines(
 class Motion:
     """A machine's body: it follows a path, and shakes about it.
 
-    ``path`` is a signal (x, y, z, roll, pitch, yaw) of the undisturbed body in n; the ``vibrations``, signals
-    of the same six, move the body against that undisturbed frame. Calling it gives the truth.
+    ``path`` is a signal (x, y, z, roll, pitch, yaw) of the undisturbed machine in n; the ``vibrations``, signals
+    of the same six, move it against that undisturbed frame. ``mounting`` (3, 3) takes b's axes to the machine's; None:
+    they are the same. Calling it gives the truth.
     """
 
     path: Signal
     vibrations: tuple[Signal, ...] = ()
+    mounting: Floats | None = None
 
     def undisturbed(self, t_s: Floats) -> Kinematics:
         """The body as it would travel without vibration."""
-        return rigid(*self.path(t_s))
+        return self._mounted(rigid(*self.path(t_s)))
 
     def __call__(self, t_s: Floats) -> Kinematics:
         """The body b in n at times (n,) s."""
-        motion = self.undisturbed(t_s)
         if not self.vibrations:
-            return motion
+            return self.undisturbed(t_s)
         shaking = [vibration(t_s) for vibration in self.vibrations]
-        return compose(motion, rigid(*(sum(parts) for parts in zip(*shaking, strict=True))))
+        shaken = rigid(*(sum(parts) for parts in zip(*shaking, strict=True)))
+        return self._mounted(compose(rigid(*self.path(t_s)), shaken))
+
+    def _mounted(self, machine: Kinematics) -> Kinematics:
+        C = self.mounting
+        if C is None:
+            return machine
+        return replace(machine, R=machine.R @ C, omega=machine.omega @ C, alpha=machine.alpha @ C)
 
 
 def smooth_step(x: Floats) -> Floats:

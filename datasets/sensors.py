@@ -110,25 +110,28 @@ def odometer(
     rate_hz: float,
     tick_m: float = 0.0,
     slips: int = 0,
+    yaw_pitch_deg: tuple[float, float] = (0.0, 0.0),
 ) -> Sensed:
     """Mean forward speed of the contact point over each period, stamped at its end.
 
     The tracks roll with the undisturbed machine: an odometer does not feel the body's vibration. The forward axis
-    is b's x axis; its other components are not measured and given as zero. An encoder counts whole ticks of
-    ``tick_m``, 0 as many as it likes. In each of ``slips`` stretches of 1 to 3 s, ``slips_s`` (k, 2) of ``drawn``, it
-    turns 20 to 50 % too far.
+    is b's x axis turned by ``yaw_pitch_deg``; its other components are not measured and given as zero. An encoder
+    counts whole ticks of ``tick_m``, 0 as many as it likes. In each of ``slips`` stretches of 1 to 3 s, ``slips_s``
+    (k, 2) of ``drawn``, it turns 20 to 50 % too far.
     """
     edges_ns = ticks(scene.duration_s, rate_hz)
+    yaw, pitch = np.radians(yaw_pitch_deg)
+    ahead_b = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
 
     def speed(t_s: Floats) -> Floats:
         travel = scene.motion.undisturbed(t_s)
         _, velocity_n = travel.at_point(sensor.arm)
-        return rotate_back(travel.R, velocity_n)[:, :1]
+        return rotate_back(travel.R, velocity_n) @ ahead_b[:, None]
 
     true = period_means(speed, edges_ns, panel_s=1 / rate_hz)[:, 0]
     scale = sensor.scale + sensor.scale_sd * rng.standard_normal()
     measured = (1 + scale) * true + sensor.times * sensor.sigma_mps * rng.standard_normal(len(true))
-    drawn = {"scale": scale}
+    drawn: dict[str, Any] = {"scale": scale, "yaw_pitch_deg": yaw_pitch_deg}
     if slips > 0:
         at, length, excess = rng.random((slips, 3)).T * [[scene.duration_s], [2.0], [0.3]] + [[0.0], [1.0], [0.2]]
         end_s = edges_ns[1:, None] * 1e-9
@@ -248,7 +251,14 @@ def barometer(
         then = -scene.motion(t_s).position[:, 2]
         drift = drift_pa_per_h / 3600 * trend * t_s
         measured, offset_s = column(then) + drift + noise_pa * white[converted], 0.0
-    drawn = {"air_k": air_k, "collar_pa": collar_pa, "warming": warming}
+    drawn = {
+        "air_k": air_k,
+        "collar_pa": collar_pa,
+        "warming": warming,
+        # against pressure turned into height with the standard atmosphere, 288.15 K and 6.5 K/km
+        "scale": 288.15 / air_k - 1.0,
+        "lapse_kpkm": 1e3 * (warming - STANDARD_WARMING),
+    }
     return Sensed(series(offset_s, measured), series(0.0, clean), drawn)
 
 

@@ -21,6 +21,7 @@ from functools import partial
 from itertools import cycle
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from datasets.motion import Lines, Motion, Spline, integral, lines, rigid, rotate, smooth_step
 from datasets.sensors import imu, magnetometer, odometer, prism
@@ -94,18 +95,23 @@ def make(
     sensors = {
         "imu": partial(imu, rate_hz=imu_rate_hz),
         "prism": partial(prism, rate_hz=prism_rate_hz, gaps=prism_gaps),
-        "odometer": partial(odometer, rate_hz=odometer_rate_hz),
         "magnetometer": partial(magnetometer, rate_hz=magnetometer_rate_hz),
     }
     if "odometer" not in machine.sensors:
         raise RigError("tbm-drive: the rig has no sensor called odometer; its arm_m says where the machine stands")
     tracks: Odometer = machine.sensors["odometer"]
-    if tracks.yaw_deg or tracks.pitch_deg or tracks.mounting_sd_deg:
-        raise RigError("tbm-drive: the tracks run along b's x axis; its odometer has no yaw, pitch or mounting sd")
+    turned = tracks.mounting_sd_deg * stream(seed, "mounting").standard_normal(2)
+    yaw_deg, pitch_deg = tracks.yaw_deg + turned[0], tracks.pitch_deg + turned[1]
+    sensors["odometer"] = partial(odometer, rate_hz=odometer_rate_hz, yaw_pitch_deg=(yaw_deg, pitch_deg))
+    mounting = None  # of the IMU in the machine, whose x axis the tracks run along
+    if yaw_deg or pitch_deg:
+        mounting = Rotation.from_euler("ZY", [yaw_deg, pitch_deg], degrees=True).inv().as_matrix()
     plan = Plan.over(duration)
     slide_density = slide * tracks.lateral_sigma / np.sqrt(odometer_rate_hz)
-    travel = path(plan, tracks.arm, slide_density, stream(seed, "slide"))
-    motion = Motion(travel, shaking(plan, vibration, stream(seed, "vibration")) if vibration else ())
+    contact_m = tracks.arm if mounting is None else mounting @ tracks.arm
+    travel = path(plan, contact_m, slide_density, stream(seed, "slide"))
+    shaken = shaking(plan, vibration, stream(seed, "vibration")) if vibration else ()
+    motion = Motion(travel, shaken, mounting)
     return simulate(
         "tbm-drive",
         motion,
@@ -158,13 +164,13 @@ class Plan:
 
 def path(
     plan: Plan,
-    contact_b: Floats,
+    contact_m: Floats,
     slide_density: float,
     rng: np.random.Generator,
     start: Floats = START,
     start_yaw_deg: float = START_YAW_DEG,
 ) -> Spline:
-    """The IMU's undisturbed way (x, y, z, roll, pitch, yaw), the machine standing on ``contact_b`` (3,).
+    """The IMU's undisturbed way (x, y, z, roll, pitch, yaw), the machine standing on ``contact_m`` (3,).
 
     ``slide_density`` is the white noise of the contact point's sideways and upward speed, m/s/sqrt(Hz).
     """
@@ -178,7 +184,7 @@ def path(
     tracks = np.column_stack([x, y, start[2] + height, roll, pitch, yaw])
     R = rigid(tracks, tracks, tracks).R
     slid = slide_density / np.sqrt(STEP_S) * plan.moving[:, None] * rng.standard_normal((len(plan.t_s), 2))
-    tracks[:, :3] += STEP_S * np.cumsum(rotate(R, np.pad(slid, ((0, 0), (1, 0)))), axis=0) - R @ contact_b
+    tracks[:, :3] += STEP_S * np.cumsum(rotate(R, np.pad(slid, ((0, 0), (1, 0)))), axis=0) - R @ contact_m
     return Spline(plan.t_s, tracks)
 
 

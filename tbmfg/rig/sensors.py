@@ -223,7 +223,11 @@ class Magnetometer(Sensor):
     declination_deg: Number = Field(0.0, description="Magnetic north from true north, east positive.")
     declination_sd_deg: CalibrationSd = Field(0.0, description="0 or null: the declination is not estimated.")
     hard_iron_ut: Triple = Field(ZERO, description="Field of the machine in sensor axes, microtesla; subtracted.")
-    hard_iron_sd_ut: CalibrationSd = Field(0.0, description="Per axis; 0 or null: the hard iron is not estimated.")
+    hard_iron_sd_ut: CalibrationSd = Field(
+        0.0,
+        description="Per axis; 0 or null: the hard iron is not estimated. Only for a machine that turns all round: of "
+        "one that keeps its heading, noise passes for an own field along the Earth's.",
+    )
     rpy_deg: Triple = Field(ZERO, description="Turns sensor axes into b: roll, pitch, yaw.")
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time; the delay of the sensor's filter is part.")
     clock_offset_sd_s: CalibrationSd = Field(0.0, description="0 or null: the offset is not looked for in the log.")
