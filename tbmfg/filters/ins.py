@@ -25,6 +25,7 @@ from tbmfg.timeseries import Floats
 # Rows of one sensor gated in a row after which the next is let in: then the state is wrong, not the sensor, and its
 # covariance is to say so. A sensor whose loss is gnc may be biased for long, and stays out until it agrees again.
 REOPEN = 10
+FARTHEST = 1e10  # squared sds by which a fix may then be off: rounding of a state so wide would hide the rest of it
 TAIL = (
     4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it
 )
@@ -94,14 +95,15 @@ def run(problem: Problem, fixed: tuple[str, ...] = (), progress: Callable[[float
                 binary = rows.i[r] < k
                 before = previous if binary else x
                 parts = rows.evaluate_at(before[None], x[None], c, slice(r, r + 1))
-                shut, open_ = gates[sensor], in_a_row[sensor] >= REOPEN and rows.loss != "gnc"
+                shut = gates[sensor]
+                limit = FARTHEST if in_a_row[sensor] >= REOPEN and rows.loss != "gnc" else shut
                 prior = x.copy(), previous.copy(), P, c.copy()
-                P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut, open_)
+                P, value, logdet = _update(x, previous, P, c, *parts, free, inputs[sensor], shut, limit)
                 if logdet > WIDE and value <= shut:
                     P = _iterate(rows, r, binary, *prior, x, previous, c, free, inputs[sensor])
                 nis[sensor][r] = value
                 cost += (TAIL + rows.dof) * np.log1p(value / TAIL) + logdet
-                if value > shut and not open_:
+                if value > limit:
                     gated[sensor][r] = True
                     in_a_row[sensor] += 1
                     continue
@@ -152,13 +154,13 @@ def _iterate(
 
 
 @njit(cache=True)
-def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate, open_):
+def _update(x, previous, P, c, residual, Ji, Jj, Jc, free, places, gate, limit):
     """Correct the state ``x``, the ``previous`` keyframe's pose and the constants ``c``, in place, by one row that was
-    linearised there: covariance, its squared normalised innovation, and log det S. One beyond the ``gate`` is left
-    out, or, where the gate is ``open_``, explained by a wider covariance."""
+    linearised there: covariance, its squared normalised innovation, and log det S. One beyond the ``limit`` is left
+    out, one beyond the ``gate`` explained by a wider covariance."""
     r, H = residual[0], _jacobian(P, Ji, Jj, Jc, places)
     nis, logdet = innovation(P, H, r)
-    if nis > gate and not open_:
+    if nis > limit:
         return P, nis, logdet
     dx, P1 = correct(explaining(P, H, r, nis) if nis > gate else P, H, r)
     if nis > gate:
