@@ -56,6 +56,18 @@ def test_modes_are_the_librarys(kind):
         assert_allclose(mine, expected, atol=1e-9 * np.abs(x).max())
 
 
+def test_modes_of_signals_of_any_length_and_ends_are_the_librarys():
+    rng = np.random.default_rng(1)
+    for length in rng.integers(20, 400, size=40):
+        noise = rng.normal(size=length)
+        wave = np.sin(np.arange(length) * rng.uniform(0.05, 1.5) + rng.uniform(0.0, 6.0))
+        for x in (noise, np.cumsum(noise), wave + 0.1 * noise):
+            library = EMD()
+            library.emd(x)
+            for mine, expected in zip(modes.modes(x), library.get_imfs_and_residue(), strict=True):
+                assert_allclose(mine, expected, atol=1e-9 * np.abs(x).max())
+
+
 def test_the_pump_goes_and_the_motion_stays():
     slow, x = pump(12.0)
     inside = slice(WINDOW // 2, -WINDOW // 2)

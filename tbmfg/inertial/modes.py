@@ -1,8 +1,9 @@
 """Empirical mode decomposition by PyEMD, with the inner parts of its sifting compiled.
 
-The library sifts, and decides what is a mode; what takes its time are three of its steps, replaced by the same
-arithmetic in compiled loops: extrema and zero crossings, the cubic spline through the extrema (not-a-knot), and the
-test of convergence. Where samples repeat or are zero, or such a spline has too few knots, the library's own run.
+The library sifts, and decides what is a mode; what takes its time are four of its steps, replaced by the same
+arithmetic in compiled loops: extrema and zero crossings, their mirror images beyond the ends, the cubic spline through
+them (not-a-knot), and the test of convergence. Where samples repeat or are zero, or extrema are few, the library's own
+run.
 """
 
 from __future__ import annotations
@@ -25,6 +26,12 @@ class Sifting(EMD):
         if not plain:
             return super().find_extrema(T, S)
         return T[maxima], S[maxima], T[minima], S[minima], zeros
+
+    def prepare_points_simple(self, T, S, max_pos, max_val, min_pos, min_val):
+        """As the library's: maxima (2, .) and minima (2, .), ``nbsym`` of each mirrored at either end."""
+        if min(len(max_pos), len(min_pos)) < self.nbsym + 2:
+            return super().prepare_points_simple(T, S, max_pos, max_val, min_pos, min_val)
+        return _mirrored(T, S, max_pos.astype(np.int64), min_pos.astype(np.int64), self.nbsym)
 
     def spline_points(self, T, extrema):
         """As the library's: ``T``, and there the spline through ``extrema`` (2, n) that reach beyond it."""
@@ -70,6 +77,48 @@ def _turns(S):
                 minima[lows] = k
                 lows += 1
     return plain, maxima[:highs], minima[:lows], zeros[:crossings]
+
+
+@njit(cache=True)
+def _mirrored(T, S, highs, lows, size):
+    """Times and values of maxima (2, .) and minima (2, .), ``size`` of each mirrored at either end."""
+    last = len(S) - 1
+    left_highs, left_lows, left = _images(T, S, highs, lows, size, 0)
+    right_highs, right_lows, right = _images(T, S, highs[::-1], lows[::-1], size, last)
+    return (
+        _joined(T, S, left_highs, left, highs, right_highs, right),
+        _joined(T, S, left_lows, left, lows, right_lows, right),
+    )
+
+
+@njit(cache=True)
+def _images(T, S, highs, lows, size, end):
+    """Which maxima and minima, both in order from ``end``, are mirrored beyond it, and where. The mirror stands on the
+    outermost extremum where the end lies on its side of the next one, else at the end, which then counts as that."""
+    high = abs(highs[0] - end) < abs(lows[0] - end)
+    outer, inner = (highs, lows) if high else (lows, highs)
+    if (S[end] > S[inner[0]]) == high and S[end] != S[inner[0]]:
+        outers, inners, mirror = outer[1 : size + 1].copy(), inner[:size].copy(), outer[0]
+        reach = 2.0 * T[mirror] - np.array([T[outers[-1]], T[inners[-1]]]) - T[end]
+        if (end == 0 and reach.max() > 0.0) or (end > 0 and reach.min() < 0.0):  # the images stay inside
+            outers, mirror = outer[:size].copy(), end
+    else:
+        outers, inners, mirror = outer[:size].copy(), np.empty(size, np.int64), end
+        inners[0], inners[1:] = end, inner[: size - 1]
+    return (outers, inners, mirror) if high else (inners, outers, mirror)
+
+
+@njit(cache=True)
+def _joined(T, S, left, left_mirror, inside, right, right_mirror):
+    """Images, extrema and images in the order of time, (2, .): of several at one time the last."""
+    t = np.concatenate((2.0 * T[left_mirror] - T[left[::-1]], T[inside], 2.0 * T[right_mirror] - T[right]))
+    values = S[np.concatenate((left[::-1], inside, right))]
+    out, n = np.empty((2, len(t))), 0
+    for k in range(len(t)):
+        n -= int(n > 0 and out[0, n - 1] == t[k])
+        out[0, n], out[1, n] = t[k], values[k]
+        n += 1
+    return out[:, :n].copy()
 
 
 @njit(cache=True)
