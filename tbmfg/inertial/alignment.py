@@ -71,7 +71,7 @@ def mean_rate(steps: Steps, rows: slice) -> Floats:
     rotation vector phi that comes back, whose rate is w + phi x w / 2: the mean of w alone errs by the coning, which
     for 0.5 deg/s at 24.5 Hz about two axes is a tenth of a degree of heading. First order in phi.
     """
-    rate, dt = steps.gyro[rows], steps.dt[rows][:, None]
+    rate, dt = steps.gyro[rows], steps.dt_of(rows)[:, None]
     weight = np.sin(np.pi * (np.arange(len(rate)) + 0.5) / len(rate)) ** 2
     weight /= weight.sum()
     mean = weight @ rate
@@ -166,7 +166,7 @@ class _Inertial:
 
 def _levelled_motion(steps: Steps, R_0t: Floats, start: float, window_s: float, gravity: float) -> _Inertial:
     rows = rows_between(steps, start, start + window_s)
-    dt = steps.dt[rows][:, None]
+    dt = steps.dt_of(rows)[:, None]
     force = np.einsum("ij,tjk,tk->ti", R_0t[rows.start].T, R_0t[:-1][rows], steps.acc[rows])
     R_lb = level(force.mean(axis=0))
     a = force @ R_lb.T - [0.0, 0.0, gravity]

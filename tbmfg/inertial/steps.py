@@ -38,6 +38,10 @@ class Steps:
     def dt(self) -> Floats:
         return np.diff(self.edges_s)
 
+    def dt_of(self, rows: slice) -> Floats:
+        """``dt`` of some steps, from one to another, without computing it for all."""
+        return np.diff(self.edges_s[rows.start : rows.stop + 1])
+
     @property
     def end_s(self) -> float:
         return float(self.edges_s[-1])

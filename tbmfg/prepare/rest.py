@@ -99,7 +99,7 @@ def _vibration(steps: Steps, signal: Floats, intervals: list[tuple[float, float]
         part = signal[rows]
         if len(part) < 10:
             continue
-        v = np.cumsum((part - part.mean(axis=0)) * steps.dt[rows][:, None], axis=0)
+        v = np.cumsum((part - part.mean(axis=0)) * steps.dt_of(rows)[:, None], axis=0)
         # drift of the mean over a second is no vibration
         size = max(1, min(round(1.0 / steps.period_s), len(part)))
         smooth = np.stack([np.convolve(v[:, a], np.ones(size) / size, mode="same") for a in range(3)], axis=1)
