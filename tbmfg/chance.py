@@ -1,5 +1,5 @@
-"""Probabilities of chi-square and Poisson numbers, by scipy's special functions: importing its statistics takes longer
-than an hour's log takes to read."""
+"""Probabilities of chi-square and Poisson numbers, by scipy's special functions: importing its statistics would slow
+every start."""
 
 from __future__ import annotations
 

@@ -15,16 +15,15 @@ import numpy as np
 from numba import njit
 
 from tbmfg.chance import chi_square_point
-from tbmfg.filters.kalman import correct, explaining, innovation, predict
+from tbmfg.filters.kalman import REOPEN, correct, explaining, innovation, predict
 from tbmfg.inertial.strapdown import correct_state, difference, propagate
 from tbmfg.problem import GATE, Problem
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
-# Rows of one sensor gated in a row after which the next is let in: then the state is wrong, not the sensor, and its
-# covariance is to say so. A sensor whose loss is gnc may be biased for long, and stays out until it agrees again.
-REOPEN = 10
+# Where a gate has to open, the state's covariance is to say so; but for a sensor whose loss is gnc, which may be biased
+# for long and stays out until it agrees again.
 FARTHEST = 1e10  # squared sds by which a fix may then be off: rounding of a state so wide would hide the rest of it
 TAIL = (
     4.0  # degrees of freedom of the Student distribution that the likelihood is taken with: outliers must not rule it

@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+REOPEN = 10  # rows of one sensor gated in a row after which it is the state that is wrong
+
 
 @njit(cache=True)
 def predict(P, Phi, Q):

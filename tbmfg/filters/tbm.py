@@ -22,7 +22,7 @@ from pydantic import Field
 
 from tbmfg.chance import chi_square_point
 from tbmfg.fields import Node, Positive
-from tbmfg.filters.kalman import correct, innovation, predict
+from tbmfg.filters.kalman import REOPEN, correct, innovation, predict
 from tbmfg.filters.scanmap import CLONE, ScanMap
 from tbmfg.inertial.strapdown import BA_, BG_, correct_state, propagate
 from tbmfg.measure import gyro_frame, position_rows
@@ -32,7 +32,6 @@ from tbmfg.sensors import Rows
 from tbmfg.state import BA, BG, NAV, POS
 from tbmfg.timeseries import Floats
 
-REOPEN = 10  # fixes gated in a row after which it is the state that is wrong, and the map if there is one
 LONGEST_S = 0.1  # the covariance is carried over at most this long at once: bias walks act inside
 
 

@@ -103,7 +103,7 @@ def smooth(x: Floats, rule: Rule, size: int) -> Floats:
 
 def running_mean(x: Floats, size: int) -> Floats:
     """Mean of x (n, k) about each sample under a Hann window of ``size`` samples, shorter at the ends."""
-    from scipy.signal import fftconvolve  # half a second to import
+    from scipy.signal import fftconvolve  # slow to import, and few rigs ask for it
 
     window = hann(size)[:, None]
     return fftconvolve(x, window, "same", axes=0) / fftconvolve(np.ones((len(x), 1)), window, "same", axes=0)

@@ -136,7 +136,7 @@ def _patches(points, voxel, keys, moments, printed):
 @njit(cache=True)
 def principal(S, values, vectors):
     """Eigenvalues of a symmetric ``S`` (3, 3), largest first, into ``values`` (3,), their unit vectors into the rows of
-    ``vectors`` (3, 3); ``S`` is overwritten. Jacobi's rotations: a library's call takes ten times as long."""
+    ``vectors`` (3, 3); ``S`` is overwritten. Jacobi's rotations, as a library's call is slow."""
     for a in range(3):
         for b in range(3):
             vectors[a, b] = 1.0 if a == b else 0.0

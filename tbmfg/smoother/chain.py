@@ -42,13 +42,13 @@ def assemble(blocks: list[Block], n: int, d: int, m: int) -> tuple[Floats, np.nd
         rows, place = np.zeros((start[-1], (2 * d if binary else d) + m + 1)), start[:-1].copy()
         for blk in chosen:
             parts = (blk.A_i, blk.A_j if binary else blk.A_i, blk.A_c, blk.b)
-            _place(rows, place, blk.i, binary, *(np.ascontiguousarray(part) for part in parts))
+            put(rows, place, blk.i, binary, *(np.ascontiguousarray(part) for part in parts))
         out += [rows, start]
     return out[0], out[1], out[2], out[3]
 
 
 @njit(cache=True)
-def _place(rows, place, i, binary, A_i, A_j, A_c, b):
+def put(rows, place, i, binary, A_i, A_j, A_c, b):
     """Write a block's rows where ``place`` says that those of their keyframes go on, and move it."""
     d, m = A_i.shape[2], A_c.shape[2]
     for r in range(len(i)):

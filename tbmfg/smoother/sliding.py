@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tbmfg.smoother.chain import Block, Elimination, end, pass_on
+from tbmfg.smoother.chain import Block, Elimination, end, pass_on, put
 from tbmfg.timeseries import Floats
 
 ROOM = 16  # keyframes, at first
@@ -49,7 +49,10 @@ class Sliding:
         """Add rows whose keyframes are counted from ``start``."""
         binary = block.A_j is not None
         rows, A_j = (self.binary, block.A_j) if binary else (self.unary, block.A_i)
-        _place(rows, self.count[:, int(binary)], block.i + start, binary, block.A_i, A_j, block.A_c, block.b)
+        first = np.arange(len(rows)) * rows.shape[1]
+        place = first + self.count[:, int(binary)]
+        put(rows.reshape(-1, rows.shape[2]), place, block.i + start, binary, block.A_i, A_j, block.A_c, block.b)
+        self.count[:, int(binary)] = place - first
 
     def eliminate(self, first: int, n: int) -> Elimination:
         """Eliminate keyframes ``first`` .. n - 1 again."""
@@ -75,20 +78,6 @@ class Sliding:
         for rows in (self.unary, self.binary, self.count, self.carry, self.conditionals, self.squares):
             rows[:-count] = rows[count:]
         return self.carry[0].copy()
-
-
-@njit(cache=True)
-def _place(rows, count, i, binary, A_i, A_j, A_c, b):
-    d, m = A_i.shape[2], A_c.shape[2]
-    for r in range(len(i)):
-        for a in range(b.shape[1]):
-            row = rows[i[r], count[i[r]]]
-            count[i[r]] += 1
-            row[:d] = A_i[r, a]
-            if binary:
-                row[d : 2 * d] = A_j[r, a]
-            row[-1 - m : -1] = A_c[r, a]
-            row[-1] = b[r, a]
 
 
 @njit(cache=True)
