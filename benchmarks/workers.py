@@ -21,7 +21,7 @@ def run_all(function: Callable[[Job], Done], jobs: list[Job], processes: int, ti
     with (
         workers.processes(min(processes, len(jobs))) as pool,
         closing(workers.run(partial(_of_numbered, function), enumerate(jobs), pool)) as ended,
-        _bar(title, len(jobs)) as step,
+        bar(title, len(jobs)) as step,
     ):
         for (number, _), future in ended:
             done[number] = future.result()
@@ -34,7 +34,8 @@ def _of_numbered(function: Callable[[Job], Done], job: tuple[int, Job]) -> Done:
 
 
 @contextmanager
-def _bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+def bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """What to call after each of ``total`` steps: a bar on a terminal, nothing in a pipe."""
     if not sys.stderr.isatty():
         yield lambda: None
         return

@@ -288,11 +288,11 @@ def test_scans_that_are_lost_and_flagged():
         T[1, 3] = 0.4 if t_s >= 6 else 0.0
         return T, t_s in (2, 7)
 
-    found = scans._run(register, iter([np.ones((5, 3))] * 10), np.arange(10.0), truth)
+    found = scans._run(register, iter([np.ones((5, 3))] * 10), np.arange(10.0), truth, True)
     assert (found["lost"], found["late"]) == (6, 1)
     assert found["flagged"] == pytest.approx(100 / 6)
     straight = scans._run(
-        lambda points, t_s: (truth[int(t_s)], False), iter([np.ones((5, 3))] * 10), np.arange(10.0), truth
+        lambda points, t_s: (truth[int(t_s)], False), iter([np.ones((5, 3))] * 10), np.arange(10.0), truth, True
     )
     assert (straight["lost"], straight["late"], straight["flagged"]) == (10, 0, 0)
     rows = {(row.estimator, row.metric): row for row in scans._rows("x", {"ours": [straight], "KISS-ICP": [found]})}
