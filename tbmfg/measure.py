@@ -17,6 +17,7 @@ from tbmfg.sensors import Rows
 from tbmfg.timeseries import Floats
 
 HELD_S = 0.05  # a speed may stand for this much time at least
+LEVEL_S = 300.0  # over which the attitude at the start and the gyro hold the horizon
 SMOOTHED_S = 4.0  # the speed that an odometer's scale is judged on is a mean over this time
 RATE_WINDOW_S = 0.02  # the angular rate at a fix is a mean over this much on either side
 
@@ -187,9 +188,16 @@ def periods(sensor: Odometer, speeds: Samples) -> tuple[Floats, Floats, float]:
 
 
 def magnetometer_rows(
-    sensor: Magnetometer, fields: Samples, keyframes_s: Floats, frame: GyroFrame, x_axis_azimuth: float, calib: slice
+    sensor: Magnetometer,
+    fields: Samples,
+    keyframes_s: Floats,
+    frame: GyroFrame,
+    R_start: Floats,
+    x_axis_azimuth: float,
+    calib: slice,
 ) -> Rows:
-    """Fields averaged to the nearest keyframe, carried there by the gyro, and with them the sensor's axes."""
+    """Fields averaged to the nearest keyframe, carried there by the gyro, and where the machine's own is to be found,
+    with them the sensor's axes and the Earth's horizontal one; ``R_start`` (3, 3) the attitude at the start."""
     t = fields.t_s - sensor.clock_offset
     k = nearest(keyframes_s, t)
     axes = frame.at(t) @ sensor.R_bm
@@ -198,11 +206,26 @@ def magnetometer_rows(
     R_k = frame.at(keyframes_s[used]).transpose(0, 2, 1)
     z = np.einsum("nij,nj->ni", R_k, mean[:, :3])
     own = MICRO_TESLA * (R_k @ mean[:, 3:].reshape(-1, 3, 3)).reshape(-1, 9)
-    data = np.column_stack([np.full(len(used), north_direction(x_axis_azimuth)), own])
+    model, data = "magnetometer", np.full((len(used), 1), north_direction(x_axis_azimuth))
     # samples average their noise away, but not the disturbance that they share
     lasting = sensor.disturbance**2 * _dependence(keyframes_s, sensor.disturbance_time)[used]
     sigma = np.sqrt(sensor.sigma**2 / count + lasting)[:, None]
-    return Rows(fields.sensor, "magnetometer", used, used, z, data, sigma, calib, count, sensor.loss)
+    if sensor.hard_iron_sd_ut:
+        begin = t < t[0] + LEVEL_S
+        H = _horizontal_field(axes[begin], carried[begin], R_start[2], sensor)
+        model, data = "magnetic_field", np.column_stack([data, own, np.full(len(used), H)])
+    return Rows(fields.sensor, model, used, used, z, data, sigma, calib, count, sensor.loss)
+
+
+def _horizontal_field(axes: Floats, carried: Floats, up: Floats, sensor: Magnetometer) -> float:
+    """Length of the Earth's horizontal field [T]: ``carried`` (n, 3), in a frame that does not turn, is the Earth's and
+    the sensor's ``axes`` (n, 3, 3) times an own one with the rig's prior; ``up`` (3,) in that frame. Where the machine
+    does not turn, it is wrong by as much as the own one is long."""
+    noise = sensor.sigma * float(np.median(np.linalg.norm(carried - np.outer(carried @ up, up), axis=1)))
+    A = np.concatenate([np.tile(np.eye(3), (len(axes), 1, 1)), axes], axis=2).reshape(-1, 6)
+    prior = np.diag([0.0] * 3 + [(noise / sensor.hard_iron_sd) ** 2] * 3)
+    earth_0 = np.linalg.solve(A.T @ A + prior, A.T @ carried.ravel())[:3]
+    return float(np.linalg.norm(earth_0 - up * (earth_0 @ up)))
 
 
 def laser_rows(

@@ -44,6 +44,12 @@ def _unrotate(x: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
+def _wrapped(angle):
+    """The same angle within half a turn of 0."""
+    return angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+
+
+@njit(cache=True)
 def _add_minus_R_skew(J: np.ndarray, x: np.ndarray, v: np.ndarray, scale: float) -> None:
     """J += scale * d(R v)/d_rot = -scale R [v]x, in place; J (3, 3)."""
     for a in range(3):
@@ -173,26 +179,48 @@ def wheel(z, data, xi, xj, c):
 def magnetometer(z, data, xi, xj, c):
     """Direction of the horizontal magnetic field, an angle in n: steel bends the vertical component most.
 
-    z (3): field in b [T]. data (10): angle of magnetic north in n [rad], then C (9, row by row), which takes the
-    machine's own field from the sensor's axes, microtesla, to what it adds to z. c (4): error of the declination, east
-    positive [rad], and what of the own field is not yet subtracted [microtesla]. The full vector is rotated by the
-    estimated attitude, so that a tilt error couples in with tan(dip): shearer (23), erratum H9.
+    z (3): field in b, with the machine's own subtracted; data (1): angle of magnetic north in n [rad]. c (.): first the
+    error of the declination, east positive [rad]. The full vector is rotated by the estimated attitude, so that a tilt
+    error couples in with tan(dip): shearer (23), erratum H9.
     """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.ones((n, 1, 4))
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.zeros((n, 1, len(c)))
     for k in range(n):
-        x, C = xi[k], data[k, 1:].copy().reshape(3, 3)
-        m = z[k] - C @ c[1:]
-        h = _rotate(x, m)
-        turn = np.zeros((3, 3))
-        _add_minus_R_skew(turn, x, m, 1.0)
-        square = h[0] * h[0] + h[1] * h[1]
+        h, turn = _rotate(xi[k], z[k]), np.zeros((3, 3))
+        _add_minus_R_skew(turn, xi[k], z[k], 1.0)
+        r[k, 0], Jc[k, 0, 0] = _wrapped(np.arctan2(h[1], h[0]) - data[k, 0] + c[0]), 1.0
         for b in range(3):
-            Ji[k, 0, b] = (h[0] * turn[1, b] - h[1] * turn[0, b]) / square
-            own = _rotate(x, C[:, b])
-            Jc[k, 0, 1 + b] = (h[1] * own[0] - h[0] * own[1]) / square
-        angle = np.arctan2(h[1], h[0]) - data[k, 0] + c[0]
-        r[k, 0] = angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+            Ji[k, 0, b] = (h[0] * turn[1, b] - h[1] * turn[0, b]) / (h[0] * h[0] + h[1] * h[1])
+    return r, Ji, np.zeros((n, 1, 0)), Jc
+
+
+@njit(cache=True)
+def magnetic_field(z, data, xi, xj, c):
+    """How far across north the horizontal magnetic field lies, for a machine that has a field of its own to be found.
+
+    z (3): field in b [T]. data (11): angle of magnetic north in n [rad], then C (9, row by row), which takes the own
+    field from the sensor's axes, microtesla, to what it adds to z, then the Earth's horizontal field H [T]. c (4):
+    error of the declination [rad] and what of the own field is not yet subtracted [microtesla]. Of what is left, h,
+    the residual is |h| / H times the angle of :func:`magnetometer`.
+
+    Noise turns a short field more than a long one: an angle alone would be least for an own field that makes h long.
+    """
+    n, d = len(z), xi.shape[1] - 6
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 4))
+    for k in range(n):
+        C, H = data[k, 1:10].copy().reshape(3, 3), data[k, 10]
+        m = z[k] - C @ c[1:]
+        h, turn = _rotate(xi[k], m), np.zeros((3, 3))
+        _add_minus_R_skew(turn, xi[k], m, 1.0)
+        length = np.sqrt(h[0] * h[0] + h[1] * h[1])
+        angle = _wrapped(np.arctan2(h[1], h[0]) - data[k, 0] + c[0])
+        r[k, 0], Jc[k, 0, 0] = length / H * angle, length / H
+        # h changes along itself by a and across by b: |h| by a, the angle by b / |h|
+        along, across = (h[0] * angle - h[1]) / (length * H), (h[1] * angle + h[0]) / (length * H)
+        for b in range(3):
+            own = _rotate(xi[k], C[:, b])
+            Ji[k, 0, b] = along * turn[0, b] + across * turn[1, b]
+            Jc[k, 0, 1 + b] = -along * own[0] - across * own[1]
     return r, Ji, np.zeros((n, 1, 0)), Jc
 
 
@@ -348,7 +376,10 @@ def _whiten(r, Ji, Jj, Jc, sigma):
 
 MODELS: dict[str, Callable] = {
     f.__name__: f
-    for f in (prism, odometer, wheel, magnetometer, barometer, laser, position, velocity, rotation, bounded, lidar)
+    for f in (
+        *(prism, odometer, wheel, magnetometer, magnetic_field, barometer, laser, position, velocity, rotation),
+        *(bounded, lidar),
+    )
 }
 
 

@@ -38,7 +38,13 @@ CASES = {
     ),
     "wheel": ([1.3], [-0.4, 0.3, -1.1, 0.7, -1.1, 0.9, 1.1], [0.07, 0.21, -0.13], 10.0),
     # the field dips by about 60 degrees: the third derivative of the angle grows as 2 tan(dip)^3
-    "magnetometer": ([14.0, -17.0, -31.0], [0.4, *(1.3 * R_BD).ravel()], [0.05, 0.8, -0.5, 1.1], 20.0),
+    "magnetometer": ([14.0, -17.0, -31.0], [0.4], [0.05], 20.0),
+    "magnetic_field": (
+        [1.4e-5, -1.7e-5, -3.1e-5],
+        [0.4, *(1.3e-6 * R_BD).ravel(), 1.9e-5],
+        [0.05, 0.8, -0.5, 1.1],
+        20.0,
+    ),
     "barometer": ([11.2], [0.04, 1.0, 3.0, -2.0], [0.02, 1.3], 20.0),
     "position": ([39.0, -69.0, 11.0], [], [], 80.0),
     # tilted by some 20 degrees, 15 m above z = 0: third derivatives grow as the distance over cos^4
@@ -56,7 +62,8 @@ CALIBRATIONS = {
     "prism": ["arm.x", "arm.y", "arm.z", "offset", "drift"],
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
-    "magnetometer": ["declination", "iron.x", "iron.y", "iron.z"],
+    "magnetometer": ["declination"],
+    "magnetic_field": ["declination", "iron.x", "iron.y", "iron.z"],
     "barometer": ["scale", "lapse"],
     "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
@@ -245,10 +252,13 @@ def test_magnetometer_at_truth_and_across_the_branch_cut():
     direction = north - declination
     field_n = np.array([np.cos(dip) * np.cos(direction), np.cos(dip) * np.sin(direction), -np.sin(dip)])
     for turn in (0.0, 0.2, 1.0, -3.0):  # direction + turn passes +-pi
-        iron_ut = np.array([3.0, -8.0, 5.0])
-        field_b = R.T @ exp_so3(np.array([0.0, 0.0, turn])) @ field_n * 48e-6 + R_BD @ iron_ut * 1e-6
-        data, c = np.array([[north, *(1e-6 * R_BD).ravel()]]), np.array([declination, *iron_ut])
-        residual, *_ = sensors.magnetometer(field_b[None], data, X_I[None], X_I[None], c)
+        iron_ut, states = np.array([3.0, -8.0, 5.0]), (X_I[None], X_I[None])
+        field_b = R.T @ exp_so3(np.array([0.0, 0.0, turn])) @ field_n * 48e-6
+        residual, *_ = sensors.magnetometer(field_b[None], np.array([[north]]), *states, np.array([declination]))
+        assert residual[0, 0] == pytest.approx(turn, abs=1e-14)
+        field_b += R_BD @ iron_ut * 1e-6
+        data, c = [[north, *(1e-6 * R_BD).ravel(), 48e-6 * np.cos(dip)]], [declination, *iron_ut]
+        residual, *_ = sensors.magnetic_field(field_b[None], np.array(data), *states, np.array(c))
         assert residual[0, 0] == pytest.approx(turn, abs=1e-14)
 
 

@@ -114,7 +114,8 @@ def view(problem: Problem, design: Design) -> Problem:
         if kind_of(name) == "odometer":
             rows.append(wheel_rows(sensor, s, edges_s, frame, calib))
         else:
-            rows.append(magnetometer_rows(sensor, s, edges_s, frame, rig.origin.x_axis_azimuth, calib))
+            R_start, azimuth = problem.prior.x[:9].reshape(3, 3), rig.origin.x_axis_azimuth
+            rows.append(magnetometer_rows(sensor, s, edges_s, frame, R_start, azimuth, calib))
     empty = {"drift_names": (), "drift_walk": np.zeros(0)}
     return replace(problem, rows=rows, samples=samples, parameters=parameters, **empty)
 
@@ -199,7 +200,7 @@ class Measurements:
         residual, Ji, _, Jc = (part[0] for part in rows.evaluate_at(one, one, c, slice(r, r + 1)))
         H = np.zeros((len(residual), NAV + len(self.free)))
         H[:, :NAV] = Ji
-        if rows.model == "magnetometer" and self.switches.mag_jacobian == "yaw_only":
+        if kind_of(rows.sensor) == "magnetometer" and self.switches.mag_jacobian == "yaw_only":
             up_b = x[6:9]
             H[:, ROT] = np.outer(H[:, ROT] @ up_b, up_b)  # (26): of a rotation in n, the third element alone
         calibrations = np.zeros((len(residual), len(c)))

@@ -52,7 +52,8 @@ def build(setup: Setup, clocks: dict[str, Clock], factors: Floats, end_s: float 
         elif isinstance(sensor, Odometer):
             rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
         elif isinstance(sensor, Magnetometer):
-            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, rig.origin.x_axis_azimuth, calib))
+            azimuth = rig.origin.x_axis_azimuth
+            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, setup.R_start, azimuth, calib))
         elif isinstance(sensor, Lidar):
             rows.append(lidar_rows(sensor, s, keyframes, setup, calib))
         elif isinstance(sensor, Laser):

@@ -225,8 +225,8 @@ class Magnetometer(Sensor):
     hard_iron_ut: Triple = Field(ZERO, description="Field of the machine in sensor axes, microtesla; subtracted.")
     hard_iron_sd_ut: CalibrationSd = Field(
         0.0,
-        description="Per axis; 0 or null: the hard iron is not estimated. Only for a machine that turns all round: of "
-        "one that keeps its heading, noise passes for an own field along the Earth's.",
+        description="Per axis; 0 or null: the hard iron is not estimated. A machine that keeps its heading shows what "
+        "lies across the field alone.",
     )
     rpy_deg: Triple = Field(ZERO, description="Turns sensor axes into b: roll, pitch, yaw.")
     clock_offset_s: Number = Field(0.0, description="Stamp minus IMU time; the delay of the sensor's filter is part.")
@@ -239,6 +239,7 @@ class Magnetometer(Sensor):
     declination = si("declination_deg", DEG)
     declination_sd = si("declination_sd_deg", DEG)
     hard_iron = si("hard_iron_ut", MICRO_TESLA)
+    hard_iron_sd = si("hard_iron_sd_ut", MICRO_TESLA)
     clock_offset = si("clock_offset_s")
     clock_offset_sd = si("clock_offset_sd_s")
 

@@ -26,6 +26,7 @@ FREE_M = 1e3  # sd of a position that a factor of a whole pose is not meant to h
 PARTS = {
     "odometer": ("XB", "X"),
     "magnetometer": ("X", ""),
+    "magnetic_field": ("X", ""),
     "barometer": ("XVD", ""),
     "laser": ("XV", ""),
     "position": ("X", ""),
