@@ -57,6 +57,7 @@ SCENARIOS = {
             "sensors.prism.clock_drift_sd_ppm=10",
             "sensors.odometer.mounting_sd_deg=0.5",
             "sensors.magnetometer.declination_sd_deg=2",
+            "sensors.magnetometer.hard_iron_sd_ut=1",
         ),
     ),
     "shearer-cut": ("shearer-cut", ()),
