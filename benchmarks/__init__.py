@@ -17,6 +17,7 @@ from __future__ import annotations
 
 BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
+    "outliers": "benchmarks.outliers",
     "attitude": "benchmarks.attitude",
     "clock": "benchmarks.clock",
     "gyrocompass": "benchmarks.gyrocompass",

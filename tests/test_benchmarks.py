@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, gyrocompass, runs, scans, speed
+from benchmarks import accuracy, gate, gyrocompass, outliers, runs, scans, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -277,6 +277,23 @@ def test_script_and_smoother_solve_the_same_problem(tmp_path):
     assert min(stages) > 0
     assert sum(stages[:-1]) <= stages[-1]
     assert found["tbmfg", "total / bare"].bound == (None, speed.LIMIT)
+
+
+def test_outliers_are_paired_with_the_fixes_that_were_made_wrong():
+    job = outliers.Job(seed=0, duration_s=20.0, size_m=2.0, shares=(0.3,), estimators=("batch",))
+    found = outliers.run(job)
+    clean, hit = found[0.0, "batch"], found[0.3, "batch"]
+    assert clean["wrong"] == 0
+    assert hit["wrong"] == hit["gated_wrong"] > 10
+    assert hit["wrong"] + hit["sound"] == clean["sound"]
+    rows = {row.metric: row for row in outliers.summarised("x", 0.3, "batch", [found, found])}
+    assert rows["gated_wrong"].mean == 100.0
+    assert rows["gated_wrong"].inside
+    assert rows["position_loss"].mean == pytest.approx(100.0 * (hit["position"] / clean["position"] - 1.0))
+    worse = {**found, (0.3, "batch"): hit | {"gated_wrong": 0.98 * hit["wrong"], "position": 2.0 * clean["position"]}}
+    rows = {row.metric: row for row in outliers.summarised("x", 0.3, "batch", [worse])}
+    assert not rows["gated_wrong"].inside
+    assert not rows["position_loss"].inside
 
 
 def test_scans_that_are_lost_and_flagged():
