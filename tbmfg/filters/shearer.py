@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,11 +27,12 @@ from pydantic import Field
 from scipy.linalg import block_diag
 
 from tbmfg.fields import Flag, Node
+from tbmfg.filters import samplewise
 from tbmfg.filters.federated import Federation, Rule
 from tbmfg.filters.kalman import correct, innovation, innovation_noise
 from tbmfg.inertial.strapdown import correct_state, propagate
-from tbmfg.measure import gyro_frame, magnetometer_rows, wheel_rows
-from tbmfg.problem import Parameters, Problem
+from tbmfg.measure import GyroFrame, Samples, magnetometer_rows, wheel_rows
+from tbmfg.problem import Problem
 from tbmfg.rig import kind_of
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV, ROT
@@ -101,23 +102,15 @@ class Filtered:
 
 def view(problem: Problem, design: Design) -> Problem:
     """The problem as a filter of ``design`` sees it: its own sensors' samples one by one, as rows at IMU edges."""
-    kinds = {kind for member in design.members for kind in member}
-    samples = {name: s for name, s in problem.samples.items() if kind_of(name) in kinds}
-    known, inertial, rig = problem.parameters, problem.inertial, problem.rig
-    own = [k for k, name in enumerate(known.names) if name.rpartition(".")[0] in samples]
-    parameters = Parameters(tuple(known.names[k] for k in own), known.mean[own], known.sd[own], known.start[own])
-    edges_s = inertial.steps.edges_s
-    frame = gyro_frame(inertial.steps, inertial.gyro, problem.prior.x[18:21])
-    rows = []
-    for name, s in samples.items():
-        sensor, calib = rig.sensors[name], parameters.slice(name)
+    edges_s, rig = problem.inertial.steps.edges_s, problem.rig
+    R_start, azimuth = problem.prior.x[:9].reshape(3, 3), rig.origin.x_axis_azimuth
+
+    def to_rows(name: str, s: Samples, frame: GyroFrame, calib: slice) -> Rows:
         if kind_of(name) == "odometer":
-            rows.append(wheel_rows(sensor, s, edges_s, frame, calib))
-        else:
-            R_start, azimuth = problem.prior.x[:9].reshape(3, 3), rig.origin.x_axis_azimuth
-            rows.append(magnetometer_rows(sensor, s, edges_s, frame, R_start, azimuth, calib))
-    empty = {"drift_names": (), "drift_walk": np.zeros(0)}
-    return replace(problem, rows=rows, samples=samples, parameters=parameters, **empty)
+            return wheel_rows(rig.sensors[name], s, edges_s, frame, calib)
+        return magnetometer_rows(rig.sensors[name], s, edges_s, frame, R_start, azimuth, calib)
+
+    return samplewise.view(problem, (kind for member in design.members for kind in member), to_rows)
 
 
 def run(
@@ -135,8 +128,11 @@ def run(
     measurements = Measurements(problem, switches)
 
     keyframes = problem.keyframe_edges
-    epochs = np.union1d(keyframes, np.concatenate([keyframes[:0], *(rows.i for rows in problem.rows)]))
-    due = [measurements.due(kinds, epochs) for kinds in design.members]
+    epochs = samplewise.epochs(problem)
+    due = [
+        samplewise.due((rows for rows in problem.rows if kind_of(rows.sensor) in kinds), epochs)
+        for kinds in design.members
+    ]
     xs, covs, history = np.empty((len(keyframes), 21)), np.empty((len(keyframes), NAV, NAV)), []
     last, output = keyframes[0], 0
     for number, epoch in enumerate(epochs):
@@ -168,15 +164,6 @@ class Measurements:
         self.nis = {rows.sensor: np.full(len(rows), np.nan) for rows in self.rows}
         self.noise = {rows.sensor: np.ones(len(rows)) for rows in self.rows}
 
-    def due(self, kinds: tuple[str, ...], epochs: np.ndarray) -> list[list[tuple[Rows, int]]]:
-        """The rows of sensors of ``kinds`` by epoch."""
-        out = [[] for _ in epochs]
-        for rows in self.rows:
-            if kind_of(rows.sensor) in kinds:
-                for r, number in enumerate(np.searchsorted(epochs, rows.i)):
-                    out[number].append((rows, r))
-        return out
-
     def update(
         self, P: Floats, beta: float, x: Floats, c: Floats, due: list[tuple[Rows, int]]
     ) -> tuple[Floats, Floats]:
@@ -196,16 +183,10 @@ class Measurements:
 
     def _linearise(self, rows: Rows, r: int, x: Floats, c: Floats) -> tuple[Floats, Floats]:
         """Whitened residual of one row and its Jacobian to [state, free calibrations]."""
-        one = x[None]
-        residual, Ji, _, Jc = (part[0] for part in rows.evaluate_at(one, one, c, slice(r, r + 1)))
-        H = np.zeros((len(residual), NAV + len(self.free)))
-        H[:, :NAV] = Ji
+        residual, H = samplewise.linearise(rows, r, x, c, self.free)
         if kind_of(rows.sensor) == "magnetometer" and self.switches.mag_jacobian == "yaw_only":
             up_b = x[6:9]
             H[:, ROT] = np.outer(H[:, ROT] @ up_b, up_b)  # (26): of a rotation in n, the third element alone
-        calibrations = np.zeros((len(residual), len(c)))
-        calibrations[:, rows.calib] = Jc
-        H[:, NAV:] = calibrations[:, self.free]
         return residual, H
 
     def _noise(self, rows: Rows, r: int, residual: Floats, HPHt: Floats) -> Floats:

@@ -22,12 +22,14 @@ from pydantic import Field
 
 from tbmfg.chance import chi_square_point
 from tbmfg.fields import Node, Positive
+from tbmfg.filters import samplewise
 from tbmfg.filters.kalman import REOPEN, correct, innovation, predict
+from tbmfg.filters.samplewise import linearise
 from tbmfg.filters.scanmap import CLONE, ScanMap
 from tbmfg.inertial.strapdown import BA_, BG_, correct_state, propagate
-from tbmfg.measure import gyro_frame, position_rows
+from tbmfg.measure import GyroFrame, Samples, position_rows
 from tbmfg.problem import GATE, Parameters, Problem
-from tbmfg.rig import Imu, kind_of
+from tbmfg.rig import Imu
 from tbmfg.sensors import Rows
 from tbmfg.state import BA, BG, NAV, POS
 from tbmfg.timeseries import Floats
@@ -64,24 +66,18 @@ class Filtered:
 
 def view(problem: Problem, switches: InsTs, kinds: tuple[str, ...] = ("prism",)) -> Problem:
     """The problem as the filter sees it: the fixes of sensors of these kinds one by one, as rows at IMU edges."""
-    samples = {name: s for name, s in problem.samples.items() if kind_of(name) in kinds}
-    known, inertial, rig = problem.parameters, problem.inertial, problem.rig
-    own = [k for k, name in enumerate(known.names) if name.rpartition(".")[0] in samples]
-    names, mean, start, sd = tuple(known.names[k] for k in own), known.mean[own], known.start[own], known.sd[own]
-    arms = np.array([".arm_" in name for name in names], dtype=bool)
-    if switches.arm == "none":
-        mean, start = np.where(arms, 0.0, mean), np.where(arms, 0.0, start)
-    sd = np.where(arms & (switches.arm == "estimated"), sd, 0.0)  # clocks are those that prepare has found
-    parameters = Parameters(names, mean, sd, start)
-    frame = gyro_frame(inertial.steps, inertial.gyro, problem.prior.x[BG_])
-    rows = [
-        position_rows(
-            rig.sensors[name], s, problem.clocks[name], inertial.steps.edges_s, frame, problem.origin_n,
-            parameters.slice(name),
-        )
-        for name, s in samples.items()
-    ]  # fmt: skip
-    return replace(problem, rows=rows, samples=samples, parameters=parameters, drift_names=(), drift_walk=np.zeros(0))
+    edges_s, rig = problem.inertial.steps.edges_s, problem.rig
+
+    def known(given: Parameters) -> Parameters:
+        arms = np.array([".arm_" in name for name in given.names], dtype=bool)
+        sd = np.where(arms & (switches.arm == "estimated"), given.sd, 0.0)  # clocks are those that prepare has found
+        told = arms & (switches.arm == "none")
+        return replace(given, mean=np.where(told, 0.0, given.mean), sd=sd, start=np.where(told, 0.0, given.start))
+
+    def to_rows(name: str, s: Samples, frame: GyroFrame, calib: slice) -> Rows:
+        return position_rows(rig.sensors[name], s, problem.clocks[name], edges_s, frame, problem.origin_n, calib)
+
+    return samplewise.view(problem, kinds, to_rows, known)
 
 
 def run(
@@ -102,11 +98,8 @@ def run(
     gated = {rows.sensor: np.zeros(len(rows), dtype=bool) for rows in problem.rows}
     in_a_row, reopened = dict.fromkeys(nis, 0), dict.fromkeys(nis, 0)
     gates = {rows.sensor: chi_square_point(GATE, rows.dof) for rows in problem.rows}
-    epochs = np.union1d(keyframes, np.concatenate([rows.i for rows in problem.rows] or [keyframes]))
-    due: list[list[tuple[Rows, int]]] = [[] for _ in epochs]
-    for rows in problem.rows:
-        for r, number in enumerate(np.searchsorted(epochs, rows.i)):
-            due[number].append((rows, r))
+    epochs = samplewise.epochs(problem)
+    due = samplewise.due(problem.rows, epochs)
 
     xs, covs, last = [], [], keyframes[0]
     for number, epoch in enumerate(epochs):
@@ -120,7 +113,8 @@ def run(
         x, P = predicted(x, P, last, epoch)
         last = epoch
         for rows, r in due[number]:
-            residual, H = linearise(rows, r, x, c, free, len(P))
+            residual, H = linearise(rows, r, x, c, free)
+            H = np.pad(H, ((0, 0), (0, len(P) - own)))  # of the scans' clone nothing
             nis[rows.sensor][r] = innovation(P, H, residual)[0]
             in_a_row[rows.sensor] += 1
             if nis[rows.sensor][r] > gates[rows.sensor]:
@@ -176,13 +170,3 @@ class Prediction:
                     Q[:, rows] *= left
             P = predict(P, Phi, Q)
         return x, P
-
-
-def linearise(rows: Rows, r: int, x: Floats, c: Floats, free: np.ndarray, size: int) -> tuple[Floats, Floats]:
-    """Whitened residual of one row and its Jacobian to [state, free calibrations, nothing], (., size)."""
-    one = x[None]
-    residual, Ji, _, Jc = (part[0] for part in rows.evaluate_at(one, one, c, slice(r, r + 1)))
-    calibrations = np.zeros((len(residual), len(c)))
-    calibrations[:, rows.calib] = Jc
-    H = np.hstack([Ji, calibrations[:, free]])
-    return residual, np.pad(H, ((0, 0), (0, size - H.shape[1])))
