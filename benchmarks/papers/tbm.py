@@ -13,7 +13,7 @@ simulator's truth is the reference of all, and ``.. to tbm-mse`` repeats their c
 logs in which an estimator errs by more at any time; ``first over 0.3 m`` the thinnest dust where it does in the mean;
 ``published ordering``: in how many logs it appears. ``.. over bound``: of ``batch``, over the least RMS that the
 Cramer-Rao bound leaves a smoother; ``.. over best filter`` is to be half where the prism is hidden, and no more than
-1.05 in the whole log, unless 1.1 times the bound is more.
+1.05 in the whole log, unless 1.05 times the bound is more.
 
 ``shaken start``, ``shaken start, enhanced``: Figs. 14 and 15. The same logs with and without inertial enhancement of
 all estimators, from an unknown heading; ``tbm-mse`` has it in both, ``tbm-mse-star`` in none. ``initial_yaw`` is the
