@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +19,9 @@ from tbmfg.lidar.air import Air
 from tbmfg.lidar.surfels import SurfelMap
 from tbmfg.mcap import read_log
 from tbmfg.measure import gyro_frame
+from tbmfg.outcome import as_found
 from tbmfg.prepare.samples import imu_steps
-from tbmfg.results import read_result_npz, refuse_existing_file
+from tbmfg.results import read_calibration, read_result_npz, refuse_existing_file
 from tbmfg.rig import Lidar, Rig, load_rig
 from tbmfg.state import Result, Trajectory
 from tbmfg.timeseries import Floats, Log, seconds
@@ -47,13 +48,15 @@ class Sharpness:
 @dataclass(frozen=True, slots=True)
 class Map:
     """Points (k, 3) m in n of a map with their normals, as Open3D's ``cloud``; of ``returns`` within the trajectory
-    ``in_air`` hang in the ``air`` and are not in it."""
+    ``in_air`` hang in the ``air`` and are not in it. ``along``: result or smoothed, the trajectory of a result's folder
+    that it was made along."""
 
     cloud: Any
     sharpness: Sharpness
     returns: int
     in_air: int
     air: Air | None
+    along: str = ""
 
     @property
     def points(self) -> Floats:
@@ -71,7 +74,8 @@ def make(
     progress: Callable[[str, float], None] | None = None,
 ) -> Map:
     """Write the map of ``log_path`` along the result in the folder ``trajectory`` to ``output`` (.ply or .pcd), and its
-    picture beside it (.png). Scans are read one by one, three times; once with ``keep_air``, which leaves nothing out.
+    picture beside it (.png): along the smoothed trajectory where the folder holds one, with the LiDAR mounted as the
+    result found it. Scans are read one by one, three times; once with ``keep_air``, which leaves nothing out.
     """
     output, folder = Path(output), Path(trajectory)
     if output.suffix not in FORMATS:
@@ -81,8 +85,9 @@ def make(
     if not (folder / "result.npz").is_file():
         raise TbmfgError(f"{folder}: holds no result; make one: tbmfg run {log_path} -o {folder}")
     log = read_log(log_path)
-    rig = load_rig(folder / "rig.yaml")
-    path = read_result_npz(folder / "result.npz")
+    rig = as_found(load_rig(folder / "rig.yaml"), read_calibration(folder))
+    along = "smoothed" if (folder / "smoothed.npz").is_file() else "result"
+    path = read_result_npz(folder / f"{along}.npz")
     made = mapped(partial(scans_in_n, log, rig, path, lidar), keep_air, progress)
     if made is None:
         raise TbmfgError(f"{log_path}: no scan lies within the trajectory of {folder}")
@@ -90,7 +95,7 @@ def make(
     open3d().io.write_point_cloud(str(scratch), made.cloud)
     scratch.replace(output)
     output.with_suffix(".png").write_bytes(raster.png(raster.picture(made.points, path.position_n)))
-    return made
+    return replace(made, along=along)
 
 
 def mapped(
@@ -135,6 +140,7 @@ def between(scans: Callable[[str], Iterable[Placed]]) -> Air:
 def sketch(log: Log, rig: Rig, result: Result) -> tuple[Floats | None, str]:
     """The first LiDAR's map along the best trajectory of ``result``, (k, 3) m in n, one point in every cube of 0.2 m of
     scans spread evenly over the log, and in words what it is; None where no scan lies within it."""
+    rig = as_found(rig, result.calibration)
     lidar = next((sensor for sensor in rig.of_kind("lidar").values() if sensor.topic in log.clouds), None)
     if lidar is None:
         return None, ""

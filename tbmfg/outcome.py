@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -10,8 +11,9 @@ import numpy as np
 
 from tbmfg import diagnosis
 from tbmfg.chance import chi_square_point
-from tbmfg.geometry import quat_from_matrix
+from tbmfg.geometry import exp_so3, quat_from_matrix, rpy_from_rotation
 from tbmfg.problem import CLOCK, GATE, Problem
+from tbmfg.rig import Rig
 from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats, Times
 
@@ -149,6 +151,22 @@ def calibrations(problem: Problem, c: Floats, sd: Floats) -> dict[str, Calibrate
             _shaped(unit * value), _shaped(unit * sd[part]), estimated, None if observed is None else _shaped(observed)
         )
     return found
+
+
+def as_found(rig: Rig, calibration: Mapping[str, Calibrated]) -> Rig:
+    """``rig`` with its LiDARs mounted as a result's ``calibration`` found them, as :func:`tbmfg.sensors.lidar` has it:
+    in b at the place found, their axes R_bl Exp(d) by the turn found."""
+    sensors = dict(rig.sensors)
+    for name, sensor in rig.of_kind("lidar").items():
+        place, turn = (calibration.get(f"{name}_{PUBLIC[what][1]}") for what in ("mount_x", "turn_x"))
+        found: dict[str, tuple[float, ...]] = {}
+        if place is not None and place.estimated:
+            found["xyz_m"] = tuple(place.value)
+        if turn is not None and turn.estimated:
+            R_bl = sensor.T_bl.R @ exp_so3(np.array(turn.value) / DEG)
+            found["rpy_deg"] = tuple((rpy_from_rotation(R_bl) * DEG).tolist())
+        sensors[name] = sensor.model_copy(update={"T_bl": sensor.T_bl.model_copy(update=found)})
+    return rig.model_copy(update={"sensors": sensors})
 
 
 def _shaped(values: np.ndarray) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from tbmfg import storage
 from tbmfg.errors import TbmfgError
 from tbmfg.geometry import matrix_from_quat
-from tbmfg.state import Innovations, Result, Trajectory, Truth
+from tbmfg.state import Calibrated, Innovations, Result, Trajectory, Truth
 from tbmfg.timeseries import NS, Floats, Log, Series, Times
 
 if TYPE_CHECKING:
@@ -235,6 +235,18 @@ def read_result_npz(path: str | Path) -> Trajectory:
     """The trajectory of ``result.npz`` or ``smoothed.npz``."""
     with _arrays(path, Trajectory.__slots__) as arrays:
         return Trajectory(**{name: arrays[name] for name in Trajectory.__slots__})
+
+
+def read_calibration(folder: str | Path) -> dict[str, Calibrated]:
+    """What the result in ``folder`` says of calibrations in its summary; nothing of a folder without one."""
+    path = Path(folder) / SUMMARY
+    if not path.is_file():
+        return {}
+    try:
+        found = json.loads(path.read_text("utf-8"))["calibration"]
+        return {name: Calibrated(**value) for name, value in found.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise TbmfgError(f"{path}: is not the summary of a result: {error!r}; make the result again") from error
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import datasets
 from benchmarks.runs import in_memory, true_states
@@ -16,12 +17,14 @@ from datasets.lidar import raycasting
 from datasets.tbm_roadway import world
 from tbmfg import mapping
 from tbmfg.errors import TbmfgError
+from tbmfg.geometry import exp_so3, rpy_from_rotation
 from tbmfg.lidar import raster
 from tbmfg.lidar.air import Air
 from tbmfg.mcap import read_log
 from tbmfg.pipeline import run
-from tbmfg.rig import load_rig
-from tbmfg.state import Trajectory
+from tbmfg.results import read_calibration, summarise, write_result
+from tbmfg.rig import dump_rig, load_rig, override
+from tbmfg.state import Calibrated, Result, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +72,53 @@ def test_map_along_the_estimate_is_as_sharp(made, tmp_path):
         for along in (folder, tmp_path / "batch")
     ]
     assert abs(thick[1] / thick[0] - 1.0) < 0.1
+
+
+TURN, PLACE = (4.0, -3.0, 20.0), (0.3, -0.2, 0.6)  # deg and m
+
+
+@pytest.fixture
+def misread(made, tmp_path) -> Path:
+    """The truth with a rig that has the mounting wrong and a summary that has found it, beside a result that drifts."""
+    path, rig = mapping.read_result_npz(made[1] / "result.npz"), load_rig(made[1] / "rig.yaml")
+    right = rig.sensors["lidar"].T_bl
+    rpy = np.rad2deg(rpy_from_rotation(right.R @ exp_so3(np.deg2rad(TURN)).T)).tolist()
+    wrong = override(rig, [f"sensors.lidar.T_bl={{xyz_m: {list(PLACE)}, rpy_deg: {rpy}}}"])
+    found = {
+        "lidar_mounting_m": Calibrated(right.xyz_m, (0.1,) * 3, True),
+        "lidar_mounting_turn_deg": Calibrated(TURN, (0.5,) * 3, True),
+    }
+    drifting = replace(path, position_n=path.position_n + np.linspace(0, 1, 61)[:, None])
+    result = Result("isam2", drifting, path, calibration=found)
+    write_result(tmp_path / "misread", result, summarise(result, 0), dump_rig(wrong))
+    return tmp_path / "misread"
+
+
+def test_the_map_is_made_of_the_smoothed_trajectory_and_the_mounting_found(made, misread, tmp_path):
+    log, folder = made
+    right = mapping.make(str(log), folder, tmp_path / "right.ply", keep_air=True)
+    found = mapping.make(str(log), misread, tmp_path / "found.ply", keep_air=True)
+    assert (right.along, found.along) == ("result", "smoothed")
+    assert found.sharpness.thickness_m == pytest.approx(right.sharpness.thickness_m, rel=1e-3)
+    assert found.sharpness.entropy == pytest.approx(right.sharpness.entropy, abs=1e-3)
+    (misread / "summary.json").write_text("{}")
+    with pytest.raises(TbmfgError, match="not the summary of a result"):
+        mapping.make(str(log), misread, tmp_path / "found.ply", force=True)
+    (misread / "summary.json").unlink()  # and so nothing is known to be found
+    as_the_rig_says = mapping.make(str(log), misread, tmp_path / "found.ply", keep_air=True, force=True)
+    assert as_the_rig_says.sharpness.thickness_m > 1.2 * right.sharpness.thickness_m
+
+
+def test_the_sketch_has_the_mounting_found(made, misread):
+    log, path = read_log(made[0]), mapping.read_result_npz(misread / "smoothed.npz")
+    result = Result("isam2", mapping.read_result_npz(misread / "result.npz"), path)
+    true, _ = mapping.sketch(log, load_rig(made[1] / "rig.yaml"), result)
+    found, _ = mapping.sketch(
+        log, load_rig(misread / "rig.yaml"), replace(result, calibration=read_calibration(misread))
+    )
+    # a point at a cube's edge may fall to either side by rounding
+    assert len(found) == pytest.approx(len(true), rel=1e-3)
+    assert np.mean(cKDTree(true).query(found)[0] < 1e-6) > 0.99
 
 
 def test_dust_is_left_out_and_counted(tmp_path):

@@ -90,9 +90,10 @@ def map_(
         out.say("does: most rays through their place went on; they are left out")
     out.say(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
     out.say(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
-    out.say(f"map: {output}, picture: {picture}")
+    out.say(f"map: {output}, picture: {picture}; made along {trajectory}/{made.along}.npz")
     out.data(
         {"map": output, "picture": picture, "points": points, "returns": made.returns, "in_air": made.in_air}
+        | {"along": made.along}
         | asdict(sharp)
     )
 
