@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -190,10 +190,16 @@ class Outcomes:
         )
 
     def paired(
-        self, scenario: str, method: str, other: str, metric: str, other_scenario: str | None = None
+        self,
+        scenario: str,
+        method: str,
+        other: str,
+        metric: str,
+        other_scenario: str | None = None,
+        hold: Literal["better", "not worse", "nothing"] = "better",
     ) -> list[Row]:
-        """How much smaller a metric of ``method`` is than of ``other``, log by log, with its confidence interval; the
-        lower end above 0 says that ``method`` is better. None where they share fewer than two logs."""
+        """How much smaller a metric of ``method`` is than of ``other``, log by log, with its confidence interval: above
+        0 ``method`` is better, and not worse while the higher end is. None where they share fewer than two logs."""
         mine, its = self.by_seed(scenario, method, metric), self.by_seed(other_scenario or scenario, other, metric)
         shared = sorted(set(mine) & set(its))
         if len(shared) < 2:
@@ -203,10 +209,11 @@ class Outcomes:
         unit = next(one.metrics[metric][1] for one in self.outcomes if metric in one.metrics)
         name = f"{metric}: more than {method}"
         where = other if other_scenario in (None, scenario) else f"{other} ({other_scenario})"
+        held = {"better": ((0, None), None), "not worse": (None, (0, None)), "nothing": (None, None)}[hold]
         return [
             row(scenario, where, name, unit, gain),
-            Row(scenario, where, f"{name}, low", unit, low, None, len(gain), (0, None)),
-            Row(scenario, where, f"{name}, high", unit, high, None, len(gain)),
+            Row(scenario, where, f"{name}, low", unit, low, None, len(gain), held[0]),
+            Row(scenario, where, f"{name}, high", unit, high, None, len(gain), held[1]),
         ]
 
 
