@@ -19,6 +19,7 @@ BENCHMARKS = {
     "accuracy": "benchmarks.accuracy",
     "outliers": "benchmarks.outliers",
     "attitude": "benchmarks.attitude",
+    "euroc": "benchmarks.euroc",
     "clock": "benchmarks.clock",
     "gyrocompass": "benchmarks.gyrocompass",
     "reckoning": "benchmarks.reckoning",
