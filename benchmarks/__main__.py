@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import BENCHMARKS, gate
+from benchmarks.page import page
 from benchmarks.rows import print_tables, to_text
 from tbmfg.errors import TbmfgError
 
@@ -34,6 +35,7 @@ def _add(commands: argparse._SubParsersAction, name: str, module) -> None:
     )
     module.options(command)
     command.add_argument("--json", type=Path, metavar="FILE", help="write the rows")
+    command.add_argument("--html", type=Path, metavar="FILE", help="write them as charts and tables")
     command.set_defaults(module=module, gate=False, update_baseline=False)
     if hasattr(module, "GATE"):
         choice = command.add_mutually_exclusive_group()
@@ -53,6 +55,8 @@ def _run(given: argparse.Namespace) -> int:
     print_tables(rows)
     if given.json:
         given.json.write_text(to_text(rows), "utf-8")
+    if given.html:
+        given.html.write_text(page(f"benchmarks {given.name}", rows), "utf-8")
     if given.update_baseline:
         gate.save(given.baseline, given.name, module.GATE, rows)
         print(f"baseline: {given.baseline}")

@@ -65,7 +65,7 @@ def read_rows(path: str | Path) -> list[Row]:
 def print_tables(rows: list[Row]) -> None:
     """One table per scenario: a line per metric, a column per estimator; drawn by rich on a terminal only."""
     for scenario in dict.fromkeys(row.scenario for row in rows):
-        header, lines = _table([row for row in rows if row.scenario == scenario])
+        header, lines = table_of([row for row in rows if row.scenario == scenario])
         if sys.stdout.isatty():
             _print_rich(scenario, header, lines)
         else:
@@ -75,7 +75,7 @@ def print_tables(rows: list[Row]) -> None:
         print(f"{sum(bool(row.inside) for row in judged)} of {len(judged)} means lie in their bounds")
 
 
-def _table(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
+def table_of(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     """Header and lines of one scenario. Estimators share a line where unit, number and bound agree; what is published
     stands in a line below."""
     estimators = list(dict.fromkeys(row.estimator for row in rows))

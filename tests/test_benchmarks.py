@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, gyrocompass, outliers, runs, scans, speed
+from benchmarks import accuracy, gate, gyrocompass, outliers, page, runs, scans, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -172,6 +172,25 @@ def test_rows_return_from_json_and_print_plainly(capsys, tmp_path):
 
 
 # ---- gate ----
+
+
+def test_a_page_draws_what_is_judged_and_lists_all():
+    rows = [
+        *(Row("cut <1>", "ins", f"nees@{t:g}s", "per dof", 1.0, 0.2, 9, (0.5, 1.6)) for t in (10.0, 20.0)),
+        Row("cut <1>", "ins", "position", "mm", 3.0, 0.5, 9, (None, 5.0)),
+        Row("cut <1>", "ins", "ape", "mm", 2.0, 0.5, 9),
+        Row("cut <1>", "ins", "failed", "seeds", 0, None, 9, (None, 0)),
+    ]
+    over_time, judged = page.charts(rows)
+    [series] = over_time[0]
+    assert (series["x"], series["y"]) == ([10.0, 20.0], [1.0, 1.0])
+    assert series["error_y"]["array"][0] == pytest.approx(1.96 * 0.2 / 3)
+    assert [box["y1"] for box in over_time[1]["shapes"]] == [1.6, 1.6]
+    assert judged[0][0]["x"] == ["position"]
+    text = page.page("a title", rows)
+    assert "cut &lt;1&gt;" in text
+    assert all(f"<th>{metric}</th>" in text for metric in ("nees@10s", "position", "ape", "failed"))
+    assert text.count("Plotly.newPlot(") >= 2
 
 
 def test_tolerance():
