@@ -71,7 +71,7 @@ CONFIDENCE = 1.645  # standard errors below the mean that 95 % lie above
 CALIBRATED = 99.0  # % of calibrations within 3 sd
 CHANCE = 0.01  # of a false alarm in all NEES cells of a command together
 GATE = {
-    "scenario": ["tbm-drive", "tbm-drive-nominal"],
+    "scenario": ["tbm-drive", "tbm-drive-nominal", "shearer-cut", "shaft-descend-nominal"],
     "seeds": 6,
     "first_seed": 0,
     "duration": 30.0,
@@ -79,7 +79,7 @@ GATE = {
     "assignments": [],
     "corrupt": False,
     "without": "",
-    "estimators": "batch,ins",
+    "estimators": "batch,fixed-lag,ins",
 }
 
 
