@@ -26,6 +26,7 @@ BENCHMARKS = {
     "height": "benchmarks.height",
     "speed": "benchmarks.speed",
     "scale": "benchmarks.scale",
+    "pace": "benchmarks.pace",
     "lidar": "benchmarks.lidar",
     "scans": "benchmarks.scans",
     "maps": "benchmarks.maps",

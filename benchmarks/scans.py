@@ -60,16 +60,17 @@ def methods() -> dict[str, Callable[[], Register]]:
     from tbmfg.rig import Lidar
 
     own = Lidar(topic="/points")
-    found: dict[str, Callable[[], Register]] = {OURS: lambda: _ours(own), BARE: lambda: _kiss(own.voxel)}
+    found: dict[str, Callable[[], Register]] = {OURS: lambda: ours(own), BARE: lambda: bare_kiss(own.voxel)}
     for voxel in VOXELS_M:
-        found[f"KISS-ICP {voxel}"] = lambda voxel=voxel: _kiss(voxel)
+        found[f"KISS-ICP {voxel}"] = lambda voxel=voxel: bare_kiss(voxel)
         found[f"small_gicp {voxel}"] = lambda voxel=voxel: _gicp(voxel)
         if find_spec("genz_icp"):
             found[f"GenZ-ICP {voxel}"] = lambda voxel=voxel: _genz(voxel)
     return found
 
 
-def _ours(sensor) -> Register:
+def ours(sensor) -> Register:
+    """Scans by themselves, without IMU."""
     from tbmfg.lidar.clouds import Scan
     from tbmfg.lidar.motion import Blind
     from tbmfg.lidar.odometry import Odometry, matrix
@@ -83,7 +84,7 @@ def _ours(sensor) -> Register:
     return register
 
 
-def _kiss(voxel: float) -> Register:
+def bare_kiss(voxel: float) -> Register:
     from kiss_icp.config import load_config
     from kiss_icp.kiss_icp import KissICP
 

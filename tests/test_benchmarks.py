@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, gyrocompass, outliers, page, runs, scans, speed
+from benchmarks import accuracy, gate, gyrocompass, outliers, pace, page, runs, scans, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -313,6 +313,17 @@ def test_outliers_are_paired_with_the_fixes_that_were_made_wrong():
     rows = {row.metric: row for row in outliers.summarised("x", 0.3, "batch", [worse])}
     assert not rows["gated_wrong"].inside
     assert not rows["position_loss"].inside
+
+
+def test_pace_of_the_costly_steps(monkeypatch):
+    monkeypatch.setattr(pace, "COLUMNS", 120)
+    rows = pace.measure(Namespace(emd=5.0, drive=3.0, scans=20))
+    found = {(row.estimator, row.metric): row for row in rows}
+    assert found["emd", "times_real_time"].mean > 1
+    assert found["lidar", "cost"].n == found["bare", "cost"].n == 30
+    ratio = found["lidar", "cost"].mean / found["bare", "cost"].mean
+    assert found["lidar", "ratio"].mean == pytest.approx(ratio)
+    assert found["lidar", "growth"].mean >= 0
 
 
 def test_scans_that_are_lost_and_flagged():
