@@ -7,6 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import datasets
@@ -81,6 +83,55 @@ def test_points_left_out_are_counted():
         cloud[axis][:2], cloud[axis][7], cloud[axis][8] = 0.0, 0.1, 500.0
     scan = clouds.read(T_NS, cloud, SENSOR, 0.1)
     assert (scan.nonfinite, scan.zero, scan.beyond, len(scan.points), len(scan.after_s)) == (2, 2, 2, 44, 44)
+
+
+SCAN = np.tile(np.linspace(0.0, 0.0999, 40), 3)  # three beams
+CLOCKS = {  # s after the stamp to what a driver writes
+    "time": lambda s: s,
+    "offset_time": lambda s: np.clip(s * 1e6, 0, 2**32 - 1).astype(np.uint32),
+    "t": lambda s: np.round(s * 1e9),
+    "timestamp": lambda s: T_NS * 1e-9 + s,
+    "timestamps": lambda s: T_NS + np.round(np.clip(s, -9e8, 7e9) * 1e9).astype(np.int64),
+}
+INDEX = st.integers(0, len(SCAN) - 1)
+# periods before the first or after the last point, to stamps that were never set
+AWAY = st.floats(1.1, 1e10).map(lambda periods: 0.1 + 0.1 * periods) | st.floats(1.1, 1e10).map(lambda p: -0.1 * p)
+
+
+@given(
+    clock=st.sampled_from(sorted(CLOCKS)),
+    off=st.dictionaries(INDEX, AWAY, max_size=12),
+    dead=st.dictionaries(INDEX, st.tuples(st.sampled_from([np.nan, 0.0]), AWAY), max_size=60),
+)
+def test_a_bad_time_takes_its_point_and_no_other(clock, off, dead):
+    xyz, after_s = np.full((len(SCAN), 3), 3.0), SCAN.copy()
+    if clock == "offset_time":  # no sign
+        off, dead = {k: abs(s) + 0.2 for k, s in off.items()}, {k: (v, abs(s) + 0.2) for k, (v, s) in dead.items()}
+    for k, s in off.items():
+        after_s[k] = s
+    for k, (value, s) in dead.items():
+        xyz[k], after_s[k] = value, s
+    scan = clouds.read(T_NS, dict(zip("xyz", xyz.T, strict=True)) | {clock: CLOCKS[clock](after_s)}, SENSOR, 0.1)
+    kept = np.setdiff1d(np.arange(len(SCAN)), [*off, *dead])
+    assert (scan.fault, scan.astray) == ("", len(off.keys() - dead.keys()))
+    assert scan.nonfinite + scan.zero == len(dead)
+    assert_allclose(scan.after_s, SCAN[kept], atol=2e-6)
+    assert len(scan.points) == len(kept)
+
+
+@given(
+    times=st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=30).map(np.array)
+    | st.lists(st.integers(0, 2**64 - 1), max_size=30).map(lambda ints: np.array(ints, dtype=np.uint64)),
+    unit=st.sampled_from(["auto", "s", "ns"]),
+)
+def test_whatever_times_give_a_scan(times, unit):
+    cloud = {axis: np.full(len(times), 3.0) for axis in "xyz"} | {"time": times}
+    scan = clouds.read(T_NS, cloud, replace_unit(unit), 0.1)
+    assert len(scan.points) + scan.astray + scan.nonfinite == len(times)
+    if scan.after_s is not None:
+        assert len(scan.after_s) == len(scan.points)
+        assert 0.0 <= np.ptp(scan.after_s) <= 0.3 * (1 + 1e-6)
+        assert np.abs(scan.after_s).max() <= 0.6 * (1 + 1e-6)
 
 
 # ---- motion compensation ----

@@ -51,7 +51,9 @@ def register(
     for k, (start_s, scan) in enumerate(scans):
         if k % 50 == 0:
             tell(k / len(scans))
-        points.update(taken=len(scan.points), nonfinite=scan.nonfinite, zero=scan.zero, beyond=scan.beyond)
+        points.update(
+            taken=len(scan.points), nonfinite=scan.nonfinite, zero=scan.zero, beyond=scan.beyond, astray=scan.astray
+        )
         faults.update([scan.fault] if scan.fault else [])
         pose = odometry.register(scan, start_s)
         few += pose is None
@@ -85,6 +87,7 @@ def _of_points(points: Counter, sensor: Lidar) -> list[str]:
         "not finite": points["nonfinite"],
         "at zero": points["zero"],
         f"nearer than {sensor.min_range:g} or farther than {sensor.max_range:g} m": points["beyond"],
+        "with times periods from the others'": points["astray"],
     }
     said = ", ".join(f"{number / total:.0%} {what}" for what, number in parts.items() if number)
     return [f"of its {total} points {said}; left out"]
