@@ -6,12 +6,12 @@ its attitude is the gyro's course laid on the truth's attitude, and one lateness
 Standard deviations are those of a jackknife over the windows. A truth is some estimator's product, and over a short
 window may follow its inertial unit by its own attitude, which hides its faults: so the windows have three lengths L.
 
-truth_steps      count of samples after which the truth's position steps by more than 1 mm
-largest_step     the largest of them, mm; all are taken out for what follows
-attitude_late    by which the truth's attitude comes after the gyro, whose stamps are the ends of its samples, ms
-truth_late@L     by which the truth's positions come after the accelerometer, ms
-truth_turned@L   by which the truth's attitude must be turned about n's vertical to fit the truth's own positions, deg
-truth_tilted@Lx  the same about n's x, and y
+truth_steps       count of samples after which the truth's position steps by more than 1 mm
+largest_step      the largest of them, mm; all are taken out for what follows
+attitude_late     by which the truth's attitude comes after the gyro, whose stamps are the ends of its samples, ms
+truth_late@L      by which the truth's positions come after the accelerometer, ms
+truth_turned@L    by which the truth's attitude must be turned about n's vertical to fit the truth's own positions, deg
+truth_tilted_x@L  the same about n's x, and likewise about y; a window's free bias leaves little of it to be seen
 
 Then a prism is made of the truth as ``datasets import euroc`` does, 0.08 s late with 3 mm of noise, and the estimators
 are compared with the truth, the rig as it is imported: it knows neither arm nor heading nor that lateness.
@@ -24,8 +24,9 @@ arm                  error of the arm in its standard deviations, the largest of
 clock_offset         error of the prism's clock offset in its standard deviations
 
 ``NAME, mended`` is all of this with a better truth: steps taken out, positions and attitude earlier by what they are
-late, attitude turned, each by the figure of the longest windows where that is beyond three of its standard deviations
-and else not at all. What the first has over the second is the truth's. The drift that the steps corrected remains.
+late, attitude turned, each by the figure of the longest windows where that is beyond three of its standard deviations,
+about each axis of n, and else not at all. What the first has over the second is the truth's. The drift that the steps
+corrected remains.
 """
 
 from __future__ import annotations
@@ -251,7 +252,7 @@ def _truth_rows(scenario: str, arrays: Arrays) -> list[Row]:
     values = [("truth_steps", "", float(len(jump)), None, 1), ("largest_step", "mm", 1e3 * float(largest), None, 1)]
     values.append(("attitude_late", "ms", *(1e3 * part for part in longest.attitude_late), longest.count))
     values += [(f"truth_late@{one.length_s:g}s", "ms", *(1e3 * part for part in one.late), one.count) for one in found]
-    for axis, metric in ((2, "truth_turned@{:g}s"), (0, "truth_tilted@{:g}sx"), (1, "truth_tilted@{:g}sy")):
+    for axis, metric in ((2, "truth_turned@{:g}s"), (0, "truth_tilted_x@{:g}s"), (1, "truth_tilted_y@{:g}s")):
         for one in found:
             turn = (float(np.rad2deg(part[axis])) for part in one.turn)
             values.append((metric.format(one.length_s), "deg", *turn, one.count))
