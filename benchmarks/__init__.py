@@ -21,6 +21,7 @@ BENCHMARKS = {
     "attitude": "benchmarks.attitude",
     "euroc": "benchmarks.euroc",
     "clock": "benchmarks.clock",
+    "outages": "benchmarks.outages",
     "gyrocompass": "benchmarks.gyrocompass",
     "reckoning": "benchmarks.reckoning",
     "height": "benchmarks.height",

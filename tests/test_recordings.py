@@ -39,7 +39,7 @@ def test_euroc_without_the_prism_for_ten_seconds_five_times():
     rms = {name: summary["metrics"]["outage_position_rms_m"] for name, summary in summaries.items()}
     for summary in summaries.values():
         assert summary["sensors"]["prism"]["outage"] > 5 * 10 * 10
-    assert rms["batch"] <= 0.12
+    assert rms["batch"] <= 0.09  # the bound of this log is 0.075
     assert rms["batch"] <= 0.5 * rms["ins"]
 
 
