@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from tbmfg.problem import Problem
     from tbmfg.smoother.online import Online
     from tbmfg.state import Result
-    from tbmfg.timeseries import Floats
 
 
 Progress = Callable[[float], None]
@@ -45,17 +44,27 @@ def ins(problem: Problem, progress: Progress) -> Result:
 
     f = filter_.run(problem, fixed=CLOCK, progress=progress)
     out = result(problem, "ins", f.x, f.cov, f.c, f.c_cov, f.nis, f.gated)
-    out.warnings += _opened(f.reopened, filter_.REOPEN)
+    _opened(out, f.reopened, filter_.REOPEN)
     return out
 
 
-def _opened(reopened: dict[str, int], after: int) -> list[str]:
-    """How often a filter believed a sensor again that contradicted it."""
-    return [
-        f"{sensor}: after {after} rejections in a row the gate was opened, {times} in all"
-        for sensor, times in reopened.items()
-        if times
-    ]
+def _opened(out: Result, reopened: dict[str, int], after: int) -> None:
+    """Say how often a filter believed a sensor again that contradicted it, and mark it: from the first of the rejected
+    rows to the one that was taken, beyond the gate as it is."""
+    import numpy as np
+
+    from tbmfg.chance import chi_square_point
+    from tbmfg.problem import GATE
+    from tbmfg.state import Interval
+
+    for sensor, times in reopened.items():
+        if not times:
+            continue
+        out.warnings.append(f"{sensor}: after {after} rejections in a row the gate was opened, {times} in all")
+        series = out.innovations[sensor]
+        for row in np.flatnonzero((series.nis > chi_square_point(GATE, series.dof)) & ~series.gated):
+            first = row - np.argmin(series.gated[:row][::-1])  # after the last that was not rejected
+            out.intervals.append(Interval(sensor, "reopened", int(series.t_ns[first]), int(series.t_ns[row])))
 
 
 def batch(problem: Problem, progress: Progress) -> Result:
@@ -67,39 +76,65 @@ def batch(problem: Problem, progress: Progress) -> Result:
     f = filter_.run(problem, progress=lambda share: progress(0.3 * share))
     s = smoother.solve(problem, f.x, f.c, progress=lambda share: progress(0.3 + 0.7 * share))
     out = result(problem, "batch", s.x, s.cov, s.c, s.c_cov, s.nis, beyond_gate(problem, s.nis))
+    last = len(problem.keyframe_edges) - 1
     if not s.converged:
+        _mark(problem, out, "batch", "unconverged", 0, last)
         out.warnings.append(f"batch did not converge in {s.iterations} iterations; check the prior and the lever arms")
+    if s.held:
+        # the keyframes hang together: what is held at the end of the chain is not known before it either
+        _mark(problem, out, "batch", "undetermined", 0, max((k for k, _ in s.held if k >= 0), default=last))
+        out.warnings.append(
+            f"no row determines {smoother.in_words(problem, s.held)}: held where ins had it, with next to no "
+            "certainty, as its sd says; add a sensor that sees it, or a prior in the rig (initial.*_sd, sensors.*.*_sd)"
+        )
     return out
 
 
 def isam2(problem: Problem, progress: Progress) -> Result:
     """iSAM2 over the whole past: causal estimates, and the last one of every keyframe."""
-    from tbmfg.smoother import batch as smoother
     from tbmfg.smoother import incremental
 
-    online = incremental.run(problem, progress)
-    return _online(problem, "isam2", online, smoother.at(problem, online.last_x, online.c).cov)
+    return _online(problem, "isam2", incremental.run(problem, progress))
 
 
 def fixed_lag(problem: Problem, progress: Progress) -> Result:
     """Smoother over the rig's lag: causal estimates, and the last one of every keyframe before it left."""
     from tbmfg.smoother import window
 
-    online = window.run(problem, problem.rig.lag_s, progress)
-    return _online(problem, "fixed-lag", online, online.last_cov)
+    return _online(problem, "fixed-lag", window.run(problem, problem.rig.lag_s, progress))
 
 
-def _online(problem: Problem, name: str, online: Online, last_cov: Floats) -> Result:
+def _online(problem: Problem, name: str, online: Online) -> Result:
     """Result of an online solver: counts at the last estimates, and where it had to start again."""
     from tbmfg.outcome import beyond_gate, result, trajectory
 
     gated = beyond_gate(problem, online.nis)
     out = result(problem, name, online.causal_x, online.causal_cov, online.c, online.c_cov, online.nis, gated)
-    out.smoothed = trajectory(problem, online.last_x, last_cov)
-    out.warnings += [
-        f"{name} was started again at {problem.keyframes_s[k]:.1f} s: {reason}" for k, reason in online.reanchored
-    ]
+    out.smoothed = trajectory(problem, online.last_x, online.last_cov)
+    t_s, end = problem.keyframes_s, len(problem.keyframe_edges) - 1
+    for restart in online.restarts:
+        again = end if restart.again is None else restart.again
+        _mark(problem, out, name, "restarted", restart.before, again)
+        line = f"{name} failed behind {t_s[restart.before]:.1f} s ({restart.reason})"
+        if again > restart.before + 1:
+            line += f", went on by the IMU alone until {t_s[again]:.1f} s"
+        if restart.again is not None:
+            line += f", and was started again at {t_s[again]:.1f} s from there with a wider covariance"
+        out.warnings.append(f"{line}; look at what the sensors say there")
+    if online.unclosed is not None:
+        _mark(problem, out, name, "restarted", online.unclosed.before, end)
+        out.warnings.append(
+            f"{name}: the last estimates from {t_s[online.unclosed.before]:.1f} s on are the causal ones: its closing "
+            f"iterations failed ({online.unclosed.reason})"
+        )
     return out
+
+
+def _mark(problem: Problem, out: Result, name: str, kind: str, first: int, last: int) -> None:
+    """Mark what happened to an estimator from keyframe to keyframe."""
+    from tbmfg.state import Interval
+
+    out.intervals.append(Interval(name, kind, int(problem.t_ns[first]), int(problem.t_ns[last])))
 
 
 def shearer(problem: Problem, progress: Progress, name: str) -> Result:
@@ -168,7 +203,7 @@ def _ins_ts(problem: Problem, progress: Progress) -> tuple[Result, tbm.Filtered]
     f = tbm.run(seen, options, progress)
     edges_ns = to_ns(problem.inertial.steps, problem.inertial.steps.edges_s)
     out = result(seen, name, f.x, f.cov, f.c, f.c_cov, f.nis, f.gated, edges_ns)
-    out.warnings += _opened(f.reopened, tbm.REOPEN)
+    _opened(out, f.reopened, tbm.REOPEN)
     return out, f
 
 
@@ -194,8 +229,11 @@ def tbm_rrr_mf(problem: Problem, progress: Progress) -> Result:
     for prism in ins_ts.innovations:
         out.innovations[prism], out.counts[prism] = ins_ts.innovations[prism], ins_ts.counts[prism]
     out.calibration = ins_ts.calibration
+    _opened(out, f.reopened, tbm.REOPEN)
+    if not fused.converged:
+        _mark(problem, out, name, "unconverged", 0, len(f.x) - 1)
+        out.warnings.append(f"{name} did not converge in {rrr.MOST} iterations; the steps and the filter contradict")
     out.warnings += [
-        *_opened(f.reopened, tbm.REOPEN),
         *ungated(beyond_gate(seen, fused.nis)),
         f"{name} takes every state of tbm-ins-ts for an independent prior, though they share their fixes: its "
         "covariance is too small",

@@ -18,6 +18,7 @@ from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Times
 
 CLOCK = ("clock_offset", "clock_drift")  # parameters that say when a row was measured
+BREAKDOWN = (ArithmeticError, RuntimeError, np.linalg.LinAlgError)  # what numpy, compiled code and GTSAM fail with
 GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are counted as gated
 
 
@@ -143,7 +144,7 @@ def breakdown_explained(what: str) -> Iterator[None]:
     """Turn a numerical breakdown of ``what``, in numpy or in GTSAM, into an EstimationError."""
     try:
         yield
-    except (ArithmeticError, RuntimeError, np.linalg.LinAlgError) as error:
+    except BREAKDOWN as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise EstimationError(
             f"{what} broke down ({reason}): the readings and the rig contradict each other; check units, topics and "

@@ -93,7 +93,8 @@ class Innovations:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A stretch of time worth naming: kind such as "outage", "gap", "zero velocity"."""
+    """A stretch of time worth naming. Kinds of a sensor: outage, gap, lost, gated, biased, reopened, standing; of an
+    estimator, whose name then stands for the sensor's: restarted, unconverged, undetermined."""
 
     sensor: str
     kind: str

@@ -40,7 +40,7 @@ def fine(monkeypatch):
 
 def test_isam2_ends_where_batch_does(problem, smoothed):
     online = incremental.run(problem)
-    assert online.reanchored == []
+    assert online.restarts == []
     # 5 % of an sd: what iSAM2 leaves where it is until it moves by RELINEARIZE
     sd = np.sqrt(np.einsum("kii->ki", smoothed.cov))
     distance = np.abs(problems.state_errors(online.last_x, smoothed.x)) / sd
@@ -79,38 +79,86 @@ def test_counts_add_up_and_both_trajectories_come(problem):
     assert all(count.parts() == count.received for count in result.counts.values())
 
 
-def test_failed_window_starts_again_and_says_so(problem, monkeypatch):
-    solve, calls = window._Window.solve, []
-
-    def fail_once(self):
-        calls.append(self.first)
-        if len(calls) == 30:
-            raise ArithmeticError("3 unknowns of the window are not determined")
-        solve(self)
-
-    monkeypatch.setattr(window._Window, "solve", fail_once)
-    result = estimate("fixed-lag", problem)
-    assert np.isfinite(result.trajectory.position_n).all()
-    [line] = [w for w in result.warnings if "started again" in w]
-    assert "not determined" in line
-    assert f"{problem.keyframes_s[29]:.1f} s" in line
+FAILED = 29  # the keyframe behind which a solver is made to fail
+SOLVERS = {
+    "fixed-lag": (window._Window, "solve", ArithmeticError("3 unknowns of the window are not determined")),
+    "isam2": (incremental, "_newest", RuntimeError("Indeterminate linear system\n(Symbol: x29)")),
+}
 
 
-def test_failed_isam2_starts_again_and_says_so(problem, monkeypatch):
-    record, calls = incremental._record, []
+@pytest.fixture(scope="module")
+def sound(problem):
+    """What the solvers give where nothing fails."""
+    return {name: estimate(name, problem) for name in SOLVERS}
 
-    def fail_once(isam, factors, k, out, e):
-        calls.append(k)
-        if len(calls) == 30:
-            raise RuntimeError("Indeterminate linear system (Symbol: x29)")
-        record(isam, factors, k, out, e)
 
-    monkeypatch.setattr(incremental, "_record", fail_once)
+def failing(monkeypatch, name, times, problem):
+    """The result of a solver that fails so many times in a row, with the line that says so and what it marks."""
+    home, attribute, error = SOLVERS[name]
+    solve, calls = getattr(home, attribute), []
+
+    def fail(*arguments):
+        calls.append(1)
+        if FAILED < len(calls) <= FAILED + times:
+            raise error
+        return solve(*arguments)
+
+    monkeypatch.setattr(home, attribute, fail)
+    result = estimate(name, problem)
+    assert np.isfinite(result.smoothed.cov).all()
+    assert all(count.parts() == count.received for count in result.counts.values())
+    [line] = [w for w in result.warnings if " failed behind " in w]
+    assert "not determined" in line or "Indeterminate linear system (Symbol: x29)" in line
+    [marked] = [interval for interval in result.intervals if interval.kind == "restarted"]
+    assert marked.sensor == name
+    assert marked.start_ns == problem.t_ns[FAILED - 1]
+    return result, line, marked
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_failed_solver_starts_again_says_so_and_marks_it(problem, sound, monkeypatch, name, times):
+    """Once: from the estimate before it, in doubt; a second time: in more doubt."""
+    result, line, marked = failing(monkeypatch, name, times, problem)
+    assert f"started again at {problem.keyframes_s[FAILED]:.1f} s" in line
+    assert marked.end_ns == problem.t_ns[FAILED]
+    sd, undisturbed = (np.sqrt(np.einsum("kii->ki", r.smoothed.cov)) for r in (result, sound[name]))
+    # what lies before is known by what had come until then; fixes have told of the rest by the end
+    assert_allclose(result.smoothed.cov[FAILED - 1], result.trajectory.cov[FAILED - 1], rtol=1e-6, atol=1e-18)
+    # 3 %: the others were linearised, and their losses weighed, at somewhat other states
+    assert np.all(sd[:FAILED] > 0.97 * undisturbed[:FAILED])
+    assert sd[FAILED, 2] > 1.2 * undisturbed[FAILED, 2], "the heading is no longer known from before"
+    far = np.linalg.norm(result.trajectory.position_n[-1] - sound[name].trajectory.position_n[-1])
+    assert far < 4 * np.sqrt(np.trace(result.trajectory.cov[-1, 3:6, 3:6]))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("times", [30, 10**9])
+def test_a_solver_that_goes_on_failing_leaves_it_to_the_imu(problem, sound, monkeypatch, name, times):
+    result, line, marked = failing(monkeypatch, name, times, problem)
+    again = FAILED + (times - 1) // 3 if times == 30 else len(problem.t_ns) - 1
+    assert marked.end_ns == problem.t_ns[again]
+    assert f"by the IMU alone until {problem.keyframes_s[again]:.1f} s" in line
+    assert ("started again" in line) == (times == 30)
+    alone = slice(FAILED, again)
+    sd = np.sqrt(np.einsum("kii->k", result.trajectory.cov[alone, 3:6, 3:6]))
+    assert np.all(np.diff(sd) > 0), "nothing but the IMU"
+    off = np.linalg.norm(result.trajectory.position_n - sound[name].trajectory.position_n, axis=1)[alone]
+    assert np.all(off < 4 * sd)
+    if times > 30:
+        assert result.calibration["prism_lever_arm_m"].sd[0] > 0
+
+
+def test_closing_iterations_that_fail_leave_the_causal_estimates(problem, monkeypatch):
+    def fail(isam):
+        raise RuntimeError("Indeterminate linear system")
+
+    monkeypatch.setattr(incremental, "_settle", fail)
     result = estimate("isam2", problem)
-    assert np.isfinite(result.trajectory.position_n).all()
-    [line] = [w for w in result.warnings if "started again" in w]
-    assert "Indeterminate" in line
-    assert f"{problem.keyframes_s[29]:.1f} s" in line
+    assert_allclose(result.smoothed.position_n, result.trajectory.position_n)
+    assert any("are the causal ones: its closing iterations failed" in line for line in result.warnings)
+    [marked] = [interval for interval in result.intervals if interval.kind == "restarted"]
+    assert (marked.start_ns, marked.end_ns) == (problem.t_ns[0], problem.t_ns[-1])
 
 
 def test_custom_factors_have_the_jacobians_of_their_residuals(problem):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from tbmfg.estimators import estimate
 from tbmfg.filters import ins
 from tbmfg.prepare import prepare
 from tbmfg.rig import override
@@ -161,6 +162,12 @@ def test_the_gate_opens_when_it_is_the_state_that_is_wrong():
     assert gated[100 : 100 + ins.REOPEN].all()
     assert not gated[100 + ins.REOPEN]
     assert found.reopened["prism"] >= 1
+    result = estimate("ins", with_prism(problem, change))
+    marked = [interval for interval in result.intervals if interval.kind == "reopened"]
+    assert len(marked) == found.reopened["prism"]
+    t_ns = problem.t_ns[prism_of(problem).j]
+    assert (marked[0].sensor, marked[0].start_ns) == ("prism", t_ns[100])
+    assert marked[0].end_ns == t_ns[100 + ins.REOPEN]
     plain = ins.run(problem)
     # it follows; attitude and biases, which had to give way too, take longer than these ten seconds to come back
     assert_allclose(found.x[-1, 9:12] - plain.x[-1, 9:12], [1.0, 0.0, 0.0], atol=0.4)

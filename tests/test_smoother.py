@@ -278,18 +278,50 @@ def test_without_a_loss_outliers_pull():
     assert np.linalg.norm(moved) > 0.05
 
 
-def test_what_is_not_determined_is_named_with_its_times_and_the_next_move():
-    """No fixes, and next to no prior on the position."""
+def adrift(sd_m):
+    """A flight without fixes, its first position known to ``sd_m``; what it is for the filter stays a metre."""
     problem = flight_problem(2, 12.0)
-    prior = problem.prior
-    cov = prior.cov.copy()
-    cov[3:6, 3:6] = 1e16 * np.eye(3)
+    cov = problem.prior.cov.copy()
+    cov[3:6, 3:6] = sd_m**2 * np.eye(3)
     rows = [rows for rows in problem.rows if rows.model not in ("prism", "bounded")]
-    adrift = replace(problem, rows=rows, prior=replace(prior, cov=cov))
-    start = ins.run(replace(adrift, prior=prior))
-    with pytest.raises(EstimationError, match=r"not determined: .*position.*prior in the rig") as refused:
-        batch.solve(adrift, start.x, start.c)
+    return replace(problem, rows=rows, prior=replace(problem.prior, cov=cov))
+
+
+def test_what_is_not_determined_is_held_named_and_marked():
+    """No fixes, and next to no prior on the position: all else is as if it were known to a metre."""
+    problem, metre = adrift(1e8), adrift(1.0)
+    result, known = estimate("batch", problem), estimate("batch", metre)
+    [line] = [line for line in result.warnings if line.startswith("no row determines position, ")]
+    assert "prior in the rig" in line
+    [marked] = [interval for interval in result.intervals if interval.kind == "undetermined"]
+    assert (marked.sensor, marked.start_ns, marked.end_ns) == ("batch", problem.t_ns[0], problem.t_ns[-1])
+    start, c = ins.run(problem).x, problem.parameters.start
+    sd, sd_known = (sds(batch.at(one, start, c).cov) for one in (problem, metre))
+    assert min(sd[:, 3:6].min(), sds(result.trajectory.cov)[:, 3:6].min()) > 1e4
+    others = np.r_[0:3, 6:15]
+    assert_allclose(sd[:, others], sd_known[:, others], rtol=5e-3)
+    step, step_known = (np.diff(r.trajectory.position_n, axis=0) for r in (result, known))
+    assert_allclose(step, step_known, atol=1e-4)
+    assert np.linalg.norm(result.trajectory.position_n - start[:, 9:12], axis=1).max() < sd[:, 3:6].min()
+
+
+def test_what_no_prior_can_determine_is_refused_in_one_line():
+    problem = adrift(1.0)
+    rows = rows_of(problem, "magnetometer")
+    broken = with_rows(problem, "magnetometer", replace(rows, sigma=np.full_like(rows.sigma, np.nan)))
+    start = ins.run(problem)
+    with pytest.raises(EstimationError, match=r"^not determined: .* \(\d+ unknowns\); .*prior in the rig") as refused:
+        batch.solve(broken, start.x, start.c)
     assert "\n" not in str(refused.value)
+
+
+def test_iterations_that_do_not_converge_are_said_and_marked(monkeypatch):
+    monkeypatch.setattr(batch, "MAX_ITERATIONS", 1)
+    problem = flight_problem(2, 12.0)
+    result = estimate("batch", problem)
+    assert any(line.startswith("batch did not converge in 1 iterations") for line in result.warnings)
+    [marked] = [interval for interval in result.intervals if interval.kind == "unconverged"]
+    assert (marked.sensor, marked.start_ns, marked.end_ns) == ("batch", problem.t_ns[0], problem.t_ns[-1])
 
 
 # ---- drifting calibrations ----

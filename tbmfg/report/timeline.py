@@ -17,7 +17,7 @@ from tbmfg.timeseries import Floats
 ROW_PX = 34
 FINEST = 1 / 400  # of the time shown: what is shorter is drawn this long, what is closer is drawn as one
 PRESENT = "#56B4E9"
-KINDS = {"outage": "#D55E00", "gap": "#000000", "gated": "#E69F00", "standing": "#009E73"}
+KINDS = {"outage": "#D55E00", "gap": "#000000", "gated": "#E69F00", "standing": "#009E73", "restarted": "#0072B2"}
 OTHER_KIND = "#CC79A7"
 LEVELS = {"normal": "#009E73", "troubleshoot": "#E69F00", "stop": "#D55E00"}
 

@@ -1,8 +1,11 @@
-"""Batch smoothing: Gauss-Newton over the whole log, damped when a step does not pay."""
+"""Batch smoothing: Gauss-Newton over the whole log, damped when a step does not pay.
+
+What no row determines is held where it is by the weakest prior that can be told from rounding, and named.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +15,9 @@ from tbmfg.inertial.strapdown import correct_path, correct_states
 from tbmfg.problem import CLOCK, Problem
 from tbmfg.sensors import Rows
 from tbmfg.smoother import graph, losses
-from tbmfg.smoother.chain import Block, Elimination, eliminate, lengths
+from tbmfg.smoother.chain import RANK, Block, Elimination, eliminate, lengths
 from tbmfg.smoother.graph import States
+from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
 
 MAX_ITERATIONS = 100  # by weights of outliers that follow the state it converges linearly
@@ -21,13 +25,16 @@ STAGE_ITERATIONS = 2  # at each loss on the way to the truncated square
 CLOCK_REACH_S = 0.02  # of a clock beyond the one found by ``prepare``: the prism's model is first order in it
 # a step that does not pay is tried along the path, which reaches farther where nothing holds the heading, and shorter
 TRIES = ((correct_states, 1.0), (correct_path, 1.0), (correct_path, 0.3))
+WEAKEST = 100.0 * RANK  # of a column's length: an sd of 1e10 times what the firmest rows alone would leave
+ROUNDS = 5  # in which unknowns that no row determines are looked for: one that is held shows the next
 CONVERGED = 1e-3  # largest step, in posterior sds or relative to the cost, that ends the iteration
 
 
 @dataclass(frozen=True, slots=True)
 class Smoothed:
     """States (n, 21 + e) with covariances (n, 15 + e, 15 + e), calibrations with covariance, and by sensor and row the
-    squared normalised residuals at the solution."""
+    squared normalised residuals at the solution; ``held``: (keyframe, index), keyframe -1 for a free constant, of the
+    unknowns that no row determines."""
 
     x: Floats
     cov: Floats
@@ -36,12 +43,13 @@ class Smoothed:
     nis: dict[str, Floats]
     iterations: int
     converged: bool
+    held: tuple[tuple[int, int], ...] = ()
 
 
 def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], None] | None = None) -> Smoothed:
     """Most likely states and calibrations given all rows of ``problem``; starts from ``x`` (n, 21 + e) and ``c`` (m,).
 
-    Raises EstimationError when the unknowns are not determined.
+    Raises EstimationError where not even a weak prior makes the unknowns determined.
     """
     descent = _Descent(problem, States(x.copy(), c.copy()), progress)
     converged = descent.run(MAX_ITERATIONS)
@@ -53,8 +61,9 @@ def solve(problem: Problem, x: Floats, c: Floats, progress: Callable[[float], No
             mu *= losses.GROWTH
         converged = descent.run(MAX_ITERATIONS, losses.LAST_MU)
     states, free = descent.states, problem.parameters.free
-    cov, c_cov = _covariances(problem, descent.blocks, free)
-    return Smoothed(states.x, cov, states.c, c_cov, descent.nis, descent.iterations, converged)
+    chain, held = _eliminated(problem, descent.blocks, len(free))
+    cov, c_cov = _covariances(problem, chain, free)
+    return Smoothed(states.x, cov, states.c, c_cov, descent.nis, descent.iterations, converged, held)
 
 
 class _Descent:
@@ -78,7 +87,9 @@ class _Descent:
         damping = 0.0
         for _ in range(most):
             self.iterations += 1
-            dx, dc = _step(problem, self.blocks + _damping(self.blocks, damping, n, d, m), m)
+            chain, _ = _eliminated(problem, self.blocks + _damping(self.blocks, damping, n, d, m), m)
+            dx, dc = chain.solve()
+            del chain  # it is as large as all rows, which the next linearisation holds twice
             for correct, part in TRIES:
                 c = self.states.c.copy()
                 c[free] += part * dc
@@ -112,8 +123,9 @@ def at(problem: Problem, x: Floats, c: Floats) -> Smoothed:
     free, states = problem.parameters.free, States(x, c)
     imu = graph.imu_graph(problem, x), graph.no_bias(len(x))
     blocks, nis, _ = _linearise(problem, imu, states, free)
-    cov, c_cov = _covariances(problem, blocks, free)
-    return Smoothed(x, cov, c, c_cov, nis, 0, True)
+    chain, held = _eliminated(problem, blocks, len(free))
+    cov, c_cov = _covariances(problem, chain, free)
+    return Smoothed(x, cov, c, c_cov, nis, 0, True, held)
 
 
 def residual_traces(problem: Problem, x: Floats, c: Floats, sensor: str, which: slice) -> tuple[float, float]:
@@ -136,10 +148,10 @@ def residual_traces(problem: Problem, x: Floats, c: Floats, sensor: str, which: 
     return float(np.sum(signs[:, which] * left)), float(np.sum(left**2))
 
 
-def _covariances(problem: Problem, blocks: list[Block], free: np.ndarray) -> tuple[Floats, Floats]:
+def _covariances(problem: Problem, chain: Elimination, free: np.ndarray) -> tuple[Floats, Floats]:
     """Covariances of all keyframes, and of all constants (zero for known ones)."""
     m = len(problem.parameters.names)
-    cov, free_cov = eliminate(blocks, len(problem.keyframe_edges), problem.size, len(free)).covariances()
+    cov, free_cov = chain.covariances()
     c_cov = np.zeros((m, m))
     c_cov[np.ix_(free, free)] = free_cov
     return cov, c_cov
@@ -164,12 +176,53 @@ def _linearise(
     return blocks, nis, cost
 
 
-def _step(problem: Problem, blocks: list[Block], m: int) -> tuple[Floats, Floats]:
-    """Least squares step of states and free constants. The elimination is gone with its end: it is as large as all
-    rows, which the next linearisation holds twice."""
-    chain = eliminate(blocks, len(problem.keyframe_edges), problem.size, m)
-    _check(problem, chain)
-    return chain.solve()
+def _eliminated(problem: Problem, blocks: list[Block], m: int) -> tuple[Elimination, tuple[tuple[int, int], ...]]:
+    """The chain of all rows, and the unknowns that are held by weak priors because no row determines them."""
+    n, d = len(problem.keyframe_edges), problem.size
+    chain, held = eliminate(blocks, n, d, m), ()
+    for _ in range(ROUNDS):
+        missing = chain.undetermined()
+        if not missing:
+            return chain, held
+        held = tuple(sorted({*held, *missing}))
+        chain = eliminate([*blocks, _weak(chain, _vectors(held))], n, d, m)
+    if missing := chain.undetermined():
+        raise EstimationError(
+            f"not determined: {in_words(problem, missing)}; add a sensor that sees it, or a prior in the rig "
+            "(initial.*_sd, sensors.*.*_sd)"
+        )
+    return chain, held
+
+
+def _vectors(held: tuple[tuple[int, int], ...]) -> list[tuple[int, int]]:
+    """Of unknowns of keyframes the whole vectors, at the first keyframe too: what rounding makes of a direction on the
+    way along the chain would else get into all else."""
+    out = set()
+    for k, i in held:
+        whole = range(i - i % 3, i - i % 3 + 3) if k >= 0 and i < NAV else (i,)
+        out |= {(at, one) for at in {min(k, 0), k} for one in whole}
+    return sorted(out)
+
+
+def _weak(chain: Elimination, held: list[tuple[int, int]]) -> Block:
+    """A row for each of the unknowns ``held`` that keeps it where it is."""
+    n, d, m = len(held), chain.d, chain.m
+    A, A_c = np.zeros((n, 1, d)), np.zeros((n, 1, m))
+    for row, (k, i) in enumerate(held):
+        if k < 0:
+            A_c[row, 0, i] = WEAKEST * chain.border_scale[i]
+        else:
+            A[row, 0, i] = WEAKEST * chain.scale[k, i]
+    return Block(np.array([max(k, 0) for k, _ in held]), A, None, A_c, np.zeros((n, 1)))
+
+
+def in_words(problem: Problem, unknowns: Sequence[tuple[int, int]]) -> str:
+    """Unknowns (keyframe, index), keyframe -1 for a free constant, by kind and time."""
+    names = ("attitude", "position", "velocity", "accelerometer bias", "gyro bias", "drifting calibration")
+    free = [problem.parameters.names[k] for k in problem.parameters.free]
+    what = sorted({free[i] if k < 0 else names[min(i // 3, 5)] for k, i in unknowns})
+    times = [problem.keyframes_s[k] for k, _ in unknowns if k >= 0] or [problem.keyframes_s[-1]]
+    return f"{', '.join(what)}, {min(times):.1f}-{max(times):.1f} s ({len(unknowns)} unknowns)"
 
 
 def _damping(blocks: list[Block], damping: float, n: int, d: int, m: int) -> list[Block]:
@@ -179,18 +232,3 @@ def _damping(blocks: list[Block], damping: float, n: int, d: int, m: int) -> lis
     column_lengths, _ = lengths(blocks, n, d, m)
     A = np.sqrt(damping) * column_lengths[:, :, None] * np.eye(d)
     return [Block(np.arange(n), A, None, np.zeros((n, d, m)), np.zeros((n, d)))]
-
-
-def _check(problem: Problem, chain: Elimination) -> None:
-    """Explain a rank deficiency instead of dividing by zero."""
-    missing = chain.undetermined()
-    if not missing:
-        return
-    names = ("attitude", "position", "velocity", "accelerometer bias", "gyro bias", "drifting calibration")
-    free = [problem.parameters.names[k] for k in problem.parameters.free]
-    what = sorted({free[i] if k < 0 else names[min(i // 3, 5)] for k, i in missing})
-    times = [problem.keyframes_s[k] for k, _ in missing if k >= 0] or [problem.keyframes_s[-1]]
-    raise EstimationError(
-        f"not determined: {', '.join(what)}, {min(times):.1f}-{max(times):.1f} s ({len(missing)} unknowns); "
-        "add a sensor that sees it, or a prior in the rig (initial.*_sd, sensors.*.*_sd)"
-    )

@@ -38,11 +38,13 @@ class RrrMf(Node):
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """States (n, 21) and covariances (n, 15, 15), and the steps' squared normalised residuals by LiDAR."""
+    """States (n, 21) and covariances (n, 15, 15), the steps' squared normalised residuals by LiDAR, and whether the
+    last of MOST iterations had converged."""
 
     x: Floats
     cov: Floats
     nis: dict[str, Floats]
+    converged: bool
 
 
 def trusted(rows: Rows, switches: RrrMf) -> Rows:
@@ -68,6 +70,6 @@ def solve(x: Floats, cov: Floats, steps: list[Rows], c: Floats) -> Fused:
         chain = eliminate(blocks, n, d, 0)
         dx, _ = chain.solve()
         states = States(correct_states(states.x, dx), c)
-        if np.abs(dx / sd).max() < CONVERGED:
+        if converged := bool(np.abs(dx / sd).max() < CONVERGED):
             break
-    return Fused(states.x, chain.covariances()[0], nis)
+    return Fused(states.x, chain.covariances()[0], nis, converged)

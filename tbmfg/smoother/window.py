@@ -16,13 +16,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from tbmfg.errors import EstimationError
 from tbmfg.inertial.strapdown import correct_states, difference
 from tbmfg.problem import CLOCK, Problem
 from tbmfg.smoother import graph, losses
 from tbmfg.smoother.chain import Block, Elimination
 from tbmfg.smoother.graph import States
-from tbmfg.smoother.online import REANCHOR_INFLATION, Online
+from tbmfg.smoother.online import Online, follow
 from tbmfg.smoother.sliding import Sliding
 from tbmfg.state import NAV
 from tbmfg.timeseries import Floats
@@ -98,8 +97,6 @@ class _Window:
             dx, dc = chain.solve()
             self.x, self.c = correct_states(self.at.x, dx), self.at.c.copy()
             self.c[self.free] += dc
-            if not np.isfinite(self.x).all():
-                raise ArithmeticError(f"the state at keyframe {self.first + n - 1} is not finite")
             first = min([self.sliding.changed(dx, dc, NAV, MOVED), *np.flatnonzero(self._imu_moved())[:1]])
             if first == n:
                 break
@@ -199,31 +196,41 @@ def _most_rows(problem: Problem) -> tuple[int, int]:
     return int(alone.max()), int(next_too.max())
 
 
+class _Lagged:
+    """The window as a solver: a new one at every start, of keyframes that are ``lag_s`` old at the most."""
+
+    window: _Window
+
+    def __init__(self, problem: Problem, lag_s: float, out: Online) -> None:
+        self.problem, self.lag_s, self.out, self.times = problem, lag_s, out, problem.keyframes_s
+        names = problem.parameters.names
+        self.free = np.array([k for k in problem.parameters.free if not names[k].endswith(CLOCK)], dtype=int)
+
+    def begin(self, k: int, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
+        self.window = _Window(self.problem, self.free, k, x, cov)
+        return self._newest(k)
+
+    def add(self, k: int) -> tuple[Floats, Floats]:
+        window, now = self.window, self.times[k]
+        if self.times[window.first] < now - (1.0 + BUNCH) * self.lag_s:
+            leaving = np.searchsorted(self.times, now - self.lag_s) - window.first
+            window.leave(min(leaving, k - 1 - window.first), self.out)
+        window.extend()
+        window.shut_out(k, self.out.causal_cov[k - 1])
+        return self._newest(k)
+
+    def forsake(self, k: int) -> None:
+        self.window.close(self.out, k - self.window.first)
+
+    def _newest(self, k: int) -> tuple[Floats, Floats]:
+        self.window.solve()
+        return self.window.x[-1], self.window.solved.chain.covariances(k - self.window.first)[0][0]
+
+
 def run(problem: Problem, lag_s: float, progress: Callable[[float], None] | None = None) -> Online:
-    """Smooth online over ``lag_s`` seconds. Raises EstimationError where the start is not determined."""
-    times, names = problem.keyframes_s, problem.parameters.names
-    free = np.array([k for k in problem.parameters.free if not names[k].endswith(CLOCK)], dtype=int)
+    """Smooth online over ``lag_s`` seconds."""
     out = Online.empty(problem)
-    window = _Window(problem, free, 0, problem.prior.x, problem.prior.filter_cov)
-    for k in range(len(times)):
-        if k > 0:
-            if times[window.first] < times[k] - (1.0 + BUNCH) * lag_s:
-                leaving = np.searchsorted(times, times[k] - lag_s) - window.first
-                window.leave(min(leaving, k - 1 - window.first), out)
-            window.extend()
-            window.shut_out(k, out.causal_cov[k - 1])
-        guess = window.x[-1]
-        try:
-            window.solve()
-        except (ArithmeticError, np.linalg.LinAlgError) as error:
-            if k == 0:
-                raise EstimationError(f"not determined at the start: {error}; give priors in the rig") from error
-            window.close(out, k - window.first)
-            window = _Window(problem, free, k, guess, out.causal_cov[k - 1] * REANCHOR_INFLATION)
-            window.solve()
-            out.reanchored.append((k, str(error)))
-        out.causal_x[k], out.causal_cov[k] = window.x[-1], window.solved.chain.covariances(k - window.first)[0][0]
-        if progress is not None:
-            progress(k / len(times))
-    window.close(out, len(window.x))
+    solver = _Lagged(problem, lag_s, out)
+    if follow(problem, solver, out, progress):
+        solver.forsake(len(problem.keyframe_edges))
     return out
