@@ -16,9 +16,10 @@ truth_tilted_x@L  the same about n's x, and likewise about y; a window's free bi
 Then a prism is made of the truth as ``datasets import euroc`` does, 0.08 s late with 3 mm of noise, and the estimators
 are compared with the truth, the rig as it is imported: it knows neither arm nor heading nor that lateness.
 
-position             RMS of the 3-D error, mm
+position             RMS of the 3-D error, mm; asked are 3 or 1.05 of the Cramer-Rao bound, whichever is more
 tracked_point        the same of the prism, which an error of the arm leaves where it is, mm
-attitude             RMS of the angle of the error, deg
+attitude             RMS of the angle of the error, deg; 0.5 or 1.05 of the bound
+.._over_bound        either over its bound
 attitude_about_mean  the same after the one turn of n that takes the mean error out, deg
 arm                  error of the arm in its standard deviations, the largest of three
 clock_offset         error of the prism's clock offset in its standard deviations
@@ -55,6 +56,7 @@ ROUNDS = 3  # of linearising a lateness
 SIGNIFICANT = 3.0
 LATENCY_S, NOISE_M, ARM_M = 0.08, 0.003, (0.075, -0.018, -0.12)
 POSITION_MM, ATTITUDE_DEG, SDS = 3.0, 0.5, 3.0
+REACHED = 1.05  # of the Cramer-Rao bound: where that is more than is asked, no more can be asked
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -282,10 +284,21 @@ def _estimator_rows(scenario: str, arrays: Arrays, estimators: list[str]) -> lis
             tracked = errors.position_n + R.apply(arm.value) - R_true.apply(ARM_M)
             turn = R * R_true.inv()
             about_mean = (turn.mean().inv() * turn).magnitude()
+            session.hold_to_bound(result, summary)
+            reached = summary["metrics"]
+            position_mm, attitude_deg = (
+                max(asked, REACHED * unit * reached[f"bound_{metric}"])
+                for asked, unit, metric in (
+                    (POSITION_MM, 1e3, "position_rms_m"),
+                    (ATTITUDE_DEG, 1.0, "attitude_rms_deg"),
+                )
+            )
             values = {
-                ("position", "mm", POSITION_MM): 1e3 * summary["metrics"]["position_rms_m"],
+                ("position", "mm", position_mm): 1e3 * reached["position_rms_m"],
+                ("position_over_bound", "", None): reached["position_over_bound"],
                 ("tracked_point", "mm", None): 1e3 * np.sqrt(np.mean(np.sum(tracked**2, axis=1))),
-                ("attitude", "deg", ATTITUDE_DEG): summary["metrics"]["attitude_rms_deg"],
+                ("attitude", "deg", attitude_deg): reached["attitude_rms_deg"],
+                ("attitude_over_bound", "", None): reached["attitude_over_bound"],
                 ("attitude_about_mean", "deg", None): np.rad2deg(np.sqrt(np.mean(about_mean**2))),
                 ("arm", "sds", SDS): np.max(np.abs(np.subtract(arm.value, ARM_M)) / arm.sd),
                 ("clock_offset", "sds", SDS): abs(offset.value - LATENCY_S) / offset.sd,
