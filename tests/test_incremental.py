@@ -73,6 +73,17 @@ def test_last_estimate_of_the_window_beats_the_causal_one(problem):
     assert all(np.isfinite(nis).all() for nis in online.nis.values())
 
 
+def test_rows_across_the_windows_edge_are_judged_by_one_solution():
+    """A machine at rest turns by nothing from keyframe to keyframe; its heading, known to 0.3 deg, goes on moving."""
+    simulation = problems.drive(1, 60.0)
+    found = estimate("fixed-lag", prepare(problems.log_of(simulation.log_series), simulation.rig))
+    rest = found.innovations["zero_rotation"]
+    assert len(rest.nis) > 20
+    assert np.nanmax(rest.nis) < 1.0
+    assert not np.isnan(rest.nis).any()
+    assert not rest.gated.any()
+
+
 def test_counts_add_up_and_both_trajectories_come(problem):
     result = estimate("fixed-lag", problem)
     assert len(result.trajectory) == len(result.smoothed) == len(problem.keyframe_edges)

@@ -94,7 +94,7 @@ def run(problem: Problem, progress: Callable[[float], None] | None = None) -> On
         except BREAKDOWN as error:
             solver.forsake(n)
             out.unclosed = Restart(solver.first, said(error))
-    out.residuals(problem, slice(0, n), out.c)
+    out.residuals(problem, slice(0, n), n - 1, out.c)
     return out
 
 

@@ -58,10 +58,12 @@ class Online:
             parameters.start.copy(), np.diag(np.where(clocks, 0.0, parameters.sd**2)), nis,
         )  # fmt: skip
 
-    def residuals(self, problem: Problem, keyframes: slice, c: Floats) -> None:
-        """Squared normalised residuals of the keyframes' rows at the last estimates, in place."""
+    def residuals(self, problem: Problem, keyframes: slice, last: int, c: Floats) -> None:
+        """Squared normalised residuals at ``last_x``, in place, of the rows that begin at these keyframes and end at
+        ``last``, of the same solution, or before: the difference of two solutions would pass for a residual."""
         for rows in problem.rows:
-            own = slice(*np.searchsorted(rows.j, [keyframes.start, keyframes.stop]))
+            own = slice(*np.searchsorted(rows.i, [keyframes.start, keyframes.stop]))
+            own = slice(own.start, min(own.stop, np.searchsorted(rows.j, last, side="right")))
             if own.start < own.stop:
                 r = rows.evaluate_at(self.last_x[rows.i[own]], self.last_x[rows.j[own]], c, own)[0]
                 self.nis[rows.sensor][own] = np.sum(r**2, axis=1)
@@ -117,7 +119,7 @@ def _begin(problem: Problem, solver: Solver, out: Online, k: int, x: Floats, cov
         return True
     out.causal_x[k], out.causal_cov[k] = x, cov
     out.causal_are_last(slice(k, k + 1))
-    out.residuals(problem, slice(k, k + 1), out.c)
+    out.residuals(problem, slice(k, k + 1), k, out.c)
     return False
 
 

@@ -138,8 +138,9 @@ class _Window:
         solved, kept = self.solved, slice(self.first, self.first + count)
         gone = self.first - solved.first
         cov, c_cov = solved.chain.covariances(gone)
-        out.last_x[kept], out.last_cov[kept] = solved.x[gone : gone + count], cov[:count]
-        out.residuals(self.problem, kept, solved.c)
+        begun = solved.x[gone : gone + count + 1]  # and where rows that begin at the last of them end
+        out.last_x[self.first : self.first + len(begun)], out.last_cov[kept] = begun, cov[:count]
+        out.residuals(self.problem, kept, self.first + len(begun) - 1, solved.c)
         return c_cov
 
     def _imu_moved(self) -> np.ndarray:
