@@ -47,6 +47,13 @@ class Row:
     own_s: float
 
 
+def told(entry: dict[str, Any] | None) -> list[str]:
+    """Whether the log told a calibration beyond its prior, number by number: yes, no, or - where that is not asked."""
+    observed = (entry or {}).get("observed")
+    parts = observed if isinstance(observed, list | tuple) else [observed]
+    return [{True: "yes", False: "no", None: "-"}[part] for part in parts]
+
+
 def ran(summaries: Summaries) -> Summaries:
     """The estimators that gave a result."""
     return {name: summary for name, summary in summaries.items() if "not_run" not in summary}

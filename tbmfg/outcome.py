@@ -176,10 +176,12 @@ def _shaped(values: np.ndarray) -> Any:
 
 
 def _drifts(problem: Problem, x: Floats, cov: Floats) -> dict[str, Calibrated]:
-    """Drifting calibrations at the last keyframe."""
-    last = np.sqrt(np.diag(cov[-1]))
+    """Drifting calibrations at the last keyframe, where their prior has walked for as long as the log."""
+    last = np.sqrt(np.diag(cov[-1])[NAV:])
+    walked = problem.drift_walk**2 * (problem.keyframes_s[-1] - problem.keyframes_s[0])
+    seen = diagnosis.observed(last, np.sqrt(np.diag(problem.prior.cov)[NAV:] + walked))
     return {
-        f"{name.replace('.', '_')}_m": Calibrated(x[-1, 21 + k], last[NAV + k], True)
+        f"{name.replace('.', '_')}_m": Calibrated(x[-1, 21 + k], last[k], True, bool(seen[k]))
         for k, name in enumerate(problem.drift_names)
     }
 

@@ -66,7 +66,7 @@ def toy_estimate(name, prepared, *, progress=None) -> Result:
         poses(shift=0.5),
         smoothed=poses() if name == "fixed-lag" else None,
         calibration={
-            "prism_lever_arm_m": Calibrated((0.1, 0.2, 0.3), (0.001, 0.002, 0.003), True),
+            "prism_lever_arm_m": Calibrated((0.1, 0.2, 0.3), (0.001, 0.002, 0.003), True, (True, True, False)),
             "noise_factor": Calibrated(2.0, 0.0, False),
         },
         counts={"prism": Counts(received=50, used=48, gated=2)},
@@ -123,7 +123,15 @@ def test_run_writes_and_prints(toy, tmp_path):
     assert summary["metrics"]["position_rms_m"] == pytest.approx(0.5)
     assert summary["metrics"]["ape_rms_m"] == pytest.approx(0.0, abs=1e-9)
     assert "metrics_smoothed" not in summary
-    for shown in ("50 keyframes over 9.8 s", "prism_lever_arm_m", "0.1 0.2 0.3", "gated", "position_rms_m", "/truth"):
+    for shown in (
+        "50 keyframes over 9.8 s",
+        "prism_lever_arm_m",
+        "0.1 0.2 0.3",
+        "yes yes no",
+        "gated",
+        "position_rms_m",
+        "/truth",
+    ):
         assert shown in ran.stdout
     assert "warning: odometer: not estimated" in ran.stdout
     assert f"results: {tmp_path / 'out'}" in ran.stdout
@@ -137,6 +145,7 @@ def test_a_report_is_written_where_it_is_asked_for(toy, tmp_path):
     assert "Errors against the truth" in (tmp_path / "told" / "report.html").read_text("utf-8")
     ran = tbmfg("compare", "toy.mcap", "-o", str(tmp_path), "--estimators", "batch,fixed-lag")
     assert f"to read: {tmp_path / 'report.html'}" in ran.stdout
+    assert re.search(r"told by the log +batch +fixed-lag *\nprism_lever_arm_m +yes yes no +yes yes no", ran.stdout)
     report = (tmp_path / "report.html").read_text("utf-8")
     assert all(label in report for label in ("batch", "fixed-lag (causal)", "fixed-lag (last)"))
     (tmp_path / "compare.json").unlink()

@@ -39,6 +39,8 @@ def test_a_point_surveyed_at_the_bottom_tells_the_scale(estimator):
     # pressure falls with height as the air is dense: scale against 288.15 K at the height the readings seem to be at
     air_k = simulation.drawn["barometer"]["air_k"]
     assert scale.estimated
+    assert scale.observed is True
+    assert result.calibration["barometer_bias_m"].observed is True, "of 5 m that it may be off"
     assert abs(scale.value - (288.15 / air_k - 1.0)) < 4.0 * scale.sd + 0.001
     assert way > 20.0
 

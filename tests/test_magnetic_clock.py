@@ -26,6 +26,7 @@ def test_a_late_compass_is_found_late_and_its_rows_are_placed_so(offset_s):
     assert calibration.estimated
     assert abs(calibration.value - offset_s) < 4.0 * calibration.sd
     assert calibration.sd < 0.3 * 0.02  # of the prior
+    assert calibration.observed is True
     rows = next(rows for rows in late.rows if rows.sensor == "magnetometer")
     # 20 Hz of samples against a keyframe at every fix: those that belong together are the same with the clock known
     known = found(offset_s, f"sensors.magnetometer.clock_offset_s={calibration.value}", sd_s=0)

@@ -17,7 +17,7 @@ from tbmfg.report.content import rotation_sd_n
 from tbmfg.report.page import figures
 from tbmfg.report.panels import COLOURS, log_ticks, pens
 from tbmfg.report.paths import angle_rates
-from tbmfg.report.tables import known
+from tbmfg.report.tables import calibrations, known
 from tbmfg.report.thin import band, broken, extremes, packed, segments
 from tbmfg.report.timeline import merged, present
 from tbmfg.report.words import findings
@@ -217,6 +217,21 @@ def test_a_logarithmic_axis_has_ticks_that_fit_beside_each_other(low, high):
 )  # fmt: skip
 def test_calibrations_have_the_digits_that_are_known(value, sd, shown):
     assert re.sub("<.*?>", "", known(value, sd)) == shown
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "shown"),
+    [((True, True), "yes"), ((None, True), "yes"), (((True, True, False), (True, True, False)), "yes yes no"),
+     ((True, False), "a: yes b: no"), ((None, None), "–")],
+)  # fmt: skip
+def test_what_the_log_told_is_a_column_of_its_own(verdicts, shown):
+    own = {
+        name: {"calibration": {"odometer_scale": {"value": 0.0, "sd": 1.0, "estimated": True, "observed": told}}}
+        for name, told in zip("ab", verdicts, strict=True)
+    }
+    page = calibrations(Report("toy", "", 0, summaries=own), {})
+    assert "<th scope=col>told by the log</th>" in page
+    assert " ".join(re.sub("<.*?>", " ", page.rpartition("<td>")[2]).split()) == shown
 
 
 # ---- words ----

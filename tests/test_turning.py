@@ -8,7 +8,7 @@ import pytest
 from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy
 from tbmfg.inertial.steps import Steps
 from tbmfg.measure import Samples, gyro_frame
-from tbmfg.prepare.turning import against_gyro, contradictions
+from tbmfg.prepare.turning import against_gyro, calibrations, contradictions
 from tbmfg.rig import Lidar
 
 SIGMA = 5e-4  # rad, of a pose
@@ -75,6 +75,9 @@ def test_turns_about_one_axis_leave_the_mounting_about_it_open():
     found = against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0), frame)
     assert found.turn_sd[2] > 1.0
     assert found.turn_sd[:2].max() < np.deg2rad(0.3)
+    doubted = Lidar(topic="/points", T_bl_rpy_sd_deg=2.0)
+    assert calibrations("lidar", doubted, found)["lidar_turn_by_gyro_deg"].observed == (True, True, False)
+    assert calibrations("lidar", lidar(), found)["lidar_turn_by_gyro_deg"].observed is None, "no prior to beat"
     assert contradictions("lidar", lidar(), found) == []
 
 

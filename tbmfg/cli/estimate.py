@@ -79,15 +79,22 @@ def compare(
 
 
 def _print_summary(out: Terminal, summary: dict[str, Any], output: str) -> None:
+    from tbmfg.comparison import told
+
     out.say(
         f"{summary['estimator']}: {summary['keyframes']} keyframes over {summary['duration_s']:.1f} s"
         f" in {summary['wall_s']:.1f} s ({summary['realtime_factor']:.1f} x real time)"
     )
     calibration = [
-        (name, number(value["value"]), number(value["sd"]) if value["estimated"] else "not estimated")
+        (
+            name,
+            number(value["value"]),
+            number(value["sd"]) if value["estimated"] else "not estimated",
+            " ".join(told(value)),
+        )
         for name, value in summary["calibration"].items()
     ]
-    out.table(["calibration", "value", "sd"], calibration)
+    out.table(["calibration", "value", "sd", "told by the log"], calibration)
     counted = ["received", "used"] + [
         part
         for part in ("gated", "late", "duplicate", "nonfinite", "outage", "unused")
@@ -125,6 +132,12 @@ def _print_comparison(out: Terminal, summaries: dict[str, dict[str, Any]], outpu
         out.say(f"against {first['truth']}; NEES of a consistent estimator: {first['metrics']['nees_dof']}")
         if any(column.key.endswith("_over_bound") for column in columns):
             out.say("bound: Cramer-Rao, from the whole log for batch and (last), from the past alone for the others")
+    names = dict.fromkeys(name for summary in ran.values() for name in summary["calibration"])
+    verdicts = [
+        (name, *(" ".join(comparison.told(summary["calibration"].get(name))) for summary in ran.values()))
+        for name in names
+    ]
+    out.table(["told by the log", *ran], [row for row in verdicts if {*row[1:]} != {"-"}])
     out.say(f"reading and preparing, once for all: {first['shared_s']:.2f} s")
     for name, why in comparison.not_run(summaries).items():
         out.say(f"{name} not run: {why}")

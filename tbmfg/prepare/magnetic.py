@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from tbmfg.diagnosis import observed
 from tbmfg.measure import GyroFrame, Samples
 from tbmfg.prepare.start import Setup
 from tbmfg.rig import Magnetometer
@@ -31,7 +32,8 @@ def onto_gyro_clock(setup: Setup) -> dict[str, Calibrated]:
         first = s.select(s.t_s < s.t_s[0] + LONGEST_S)
         offset, sd = clock_offset(sensor, first, setup.frame)
         setup.samples[name] = Samples(name, s.t_s - (offset - sensor.clock_offset), s.values)
-        found[f"{name}_clock_offset_s"] = Calibrated(offset, sd, True)
+        seen = bool(observed(sd, sensor.clock_offset_sd))
+        found[f"{name}_clock_offset_s"] = Calibrated(offset, sd, True, seen)
         if abs(offset - sensor.clock_offset) > (REACH_SD - 0.01) * sensor.clock_offset_sd:
             setup.warnings.append(
                 f"{name}: the clock offset ran to {REACH_SD:.0f} sd of its prior, {offset:.3f} s, and is held there; "

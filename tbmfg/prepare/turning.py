@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tbmfg.diagnosis import observed
 from tbmfg.geometry import exp_so3, log_so3, rpy_from_rotation, skew
 from tbmfg.measure import GyroFrame, Samples
 from tbmfg.rig import Lidar
@@ -116,10 +117,11 @@ def _of_rotation(roots: Floats) -> Floats:
 
 def calibrations(name: str, sensor: Lidar, found: Turning) -> dict[str, Calibrated]:
     """What the turns say of clock and mounting, beside what the estimate goes by."""
+    seen = tuple(observed(found.turn_sd, sensor.rpy_sd).tolist()) if sensor.rpy_sd else None
     return {
         f"{name}_clock_offset_by_gyro_s": Calibrated(sensor.clock_offset + found.late_s, found.late_sd, True),
         f"{name}_turn_by_gyro_deg": Calibrated(
-            tuple(np.rad2deg(found.turn).tolist()), tuple(np.rad2deg(found.turn_sd).tolist()), True
+            tuple(np.rad2deg(found.turn).tolist()), tuple(np.rad2deg(found.turn_sd).tolist()), True, seen
         ),
     }
 

@@ -7,7 +7,7 @@ from html import escape
 from math import floor, log10
 from typing import Any
 
-from tbmfg.comparison import columns, ran, rows
+from tbmfg.comparison import columns, ran, rows, told
 from tbmfg.report.content import Report
 from tbmfg.report.panels import Pen
 from tbmfg.report.words import nees_bounds
@@ -69,12 +69,24 @@ def calibrations(report: Report, pen: dict[str, Pen]) -> str:
     """A row for each calibration, a column for each estimator."""
     summaries = ran(report.summaries)
     names = list(dict.fromkeys(name for summary in summaries.values() for name in summary["calibration"]))
-    body = [
-        [escape(titled(name)), *(_calibrated(summary["calibration"].get(name)) for summary in summaries.values())]
-        for name in names
-    ]
-    header = ["calibration", *(swatch(_first_pen(pen, name), name) for name in summaries)]
+    body = []
+    for name in names:
+        own = {estimator: summary["calibration"].get(name) for estimator, summary in summaries.items()}
+        body.append([escape(titled(name)), *map(_calibrated, own.values()), _told(own)])
+    header = ["calibration", *(swatch(_first_pen(pen, name), name) for name in summaries), "told by the log"]
     return table(header, body)
+
+
+def _told(own: dict[str, dict[str, Any] | None]) -> str:
+    """The estimators' verdicts on one calibration, number under number; their names where they differ."""
+    by_verdict: dict[str, list[str]] = {}
+    for estimator, entry in own.items():
+        if entry is not None:
+            by_verdict.setdefault("<br>".join(told(entry)), []).append(estimator)
+    verdicts = {verdict: names for verdict, names in by_verdict.items() if set(verdict.split("<br>")) != {"-"}}
+    if len(verdicts) < 2:
+        return next(iter(verdicts), "–")
+    return "<br>".join(f"<small>{escape(', '.join(names))}:</small><br>{said}" for said, names in verdicts.items())
 
 
 def _calibrated(entry: dict[str, Any] | None) -> str:
@@ -131,18 +143,18 @@ def counts(report: Report) -> str:
 def deviations(report: Report, pen: dict[str, Pen]) -> str:
     """What the figure of a shaft machine's deviation shows when it is pointed at: how long each estimator was at which
     level, and what the first says while it is not normal."""
-    told = {name: s["deviation"] for name, s in report.summaries.items() if s.get("deviation")}
-    if not told:
+    of = {name: s["deviation"] for name, s in report.summaries.items() if s.get("deviation")}
+    if not of:
         return ""
-    levels = list(dict.fromkeys(level for one in told.values() for level in one["level_s"]))
+    levels = list(dict.fromkeys(level for one in of.values() for level in one["level_s"]))
     spent = table(
         ["seconds", *levels],
         [
             [swatch(_first_pen(pen, name), name), *(f"{one['level_s'].get(level, 0.0):.1f}" for level in levels)]
-            for name, one in told.items()
+            for name, one in of.items()
         ],
     )
-    name, first = next(iter(told.items()))
+    name, first = next(iter(of.items()))
     states = [state for state in first["timeline"] if state["level"] != NORMAL]
     longest = sorted(sorted(states, key=lambda s: s["start_s"] - s["end_s"])[:STATES], key=lambda s: s["start_s"])
     keys = [key for key in (longest[0] if longest else ()) if key not in ("start_s", "end_s")]
