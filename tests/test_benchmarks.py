@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import datasets
-from benchmarks import accuracy, gate, gyrocompass, outliers, pace, page, runs, scans, speed
+from benchmarks import accuracy, gate, gyrocompass, lidar, outliers, pace, page, runs, scans, speed
 from benchmarks.__main__ import main
 from benchmarks.gate import Tolerance, compare
 from benchmarks.rows import Row, print_tables, read_rows, to_text
@@ -324,6 +324,12 @@ def test_pace_of_the_costly_steps(monkeypatch):
     ratio = found["lidar", "cost"].mean / found["bare", "cost"].mean
     assert found["lidar", "ratio"].mean == pytest.approx(ratio)
     assert found["lidar", "growth"].mean >= 0
+
+
+def test_the_worst_of_many_is_told_by_the_covariance():
+    assert lidar.worst_told(np.ones((1, 3))) == pytest.approx(np.sqrt(chi2.ppf(0.95, 3)), rel=0.02)
+    ten = chi2.ppf(0.95**0.1, 1)  # all ten below
+    assert lidar.worst_told(np.tile([2.0, 0.0, 0.0], (10, 1))) == pytest.approx(2.0 * np.sqrt(ten), rel=0.02)
 
 
 def test_scans_that_are_lost_and_flagged():
