@@ -8,18 +8,18 @@ import pytest
 from tbmfg.geometry import exp_so3, log_so3, rotation_from_rpy
 from tbmfg.inertial.steps import Steps
 from tbmfg.measure import Samples, gyro_frame
-from tbmfg.prepare.turning import against_gyro, calibrations, contradictions
+from tbmfg.prepare.turning import against_gyro, calibrations, contradictions, since_steps
 from tbmfg.rig import Lidar
 
 SIGMA = 5e-4  # rad, of a pose
 DT = 0.005
 
 
-def frame_of(axes=(0.5, 0.3, 0.8), end_s=60.0, standing_s=0.0):
+def frame_of(axes=(0.5, 0.3, 0.8), end_s=60.0, standing_s=0.0, rates=(1.1, 0.7, 0.4)):
     """Turning to and fro about three axes at different rates, after standing."""
     edges = np.arange(0.0, end_s + DT / 2, DT)
     middle = edges[:-1] + DT / 2
-    rate = np.stack([a * np.cos(w * middle) for a, w in zip(axes, (1.1, 0.7, 0.4), strict=True)], axis=1)
+    rate = np.stack([a * np.cos(w * middle) for a, w in zip(axes, rates, strict=True)], axis=1)
     rate[middle < standing_s] = 0.0
     none = np.zeros(len(middle))
     steps = Steps(0, edges, rate, np.zeros_like(rate), none, none, DT, ())
@@ -55,6 +55,45 @@ def test_clock_and_mounting_are_found(rpy_deg, late_s):
         assert abs(found.late_s - late_s) < 3e-3
     # 48 squares, 1 expected of each: chi-square of 48 in 1 of 10^4 cases beyond 93; sds may be large, never small
     assert np.sum(np.square(errors)) < 93.0
+
+
+def stepping(poses, size_s, at_s):
+    """The same scans with a clock that steps at a time, in the order of their stamps."""
+    t = poses.t_s + np.where(poses.t_s < at_s, 0.0, size_s)
+    _, order = np.unique(t, return_index=True)
+    return Samples(poses.sensor, t[order], poses.values[order])
+
+
+@pytest.mark.parametrize("size_s", [0.5, -0.5, 0.13, -1.7])
+def test_a_step_of_the_clock_is_told_from_a_lateness(size_s):
+    frame, right = frame_of(), rotation_from_rpy(np.deg2rad([0.5, -1.0, 1.5]))
+    sensor = lidar((0.5, -1.0, 1.5))
+    for late_s, at_s in ((0.0, 30.0), (0.04, 20.0)):
+        found = against_gyro(sensor, stepping(poses_of(frame, right, late_s), size_s, at_s), frame)
+        [(time_s, size, sd)] = found.steps
+        assert abs(time_s - at_s) < 2.5  # spans of 1 s, averaged over 1 s, one of them across the step
+        assert abs(size - size_s) < max(4.0 * sd, 3e-3)
+        assert sd < 0.01
+        [interval] = since_steps("lidar", found, frame.steps)
+        assert (interval.kind, interval.end_ns) == ("clock", round(60.0 * 1e9))
+        assert interval.start_ns == pytest.approx(1e9 * time_s, abs=1.0)
+        [line] = contradictions("lidar", sensor, found)
+        assert f"steps by {size_s:+.2f}" in line
+        assert "lidar_clock_offset_by_gyro_s" not in calibrations("lidar", sensor, found)
+
+
+def test_a_sound_clock_steps_in_no_log():
+    sensor = lidar()
+    for seed in range(10):
+        axes = np.random.default_rng(seed).uniform(0.0005, 0.5, 3)
+        frame = frame_of(tuple(axes))
+        found = against_gyro(sensor, poses_of(frame, np.eye(3), 0.0, seed), frame)
+        assert found is None or found.steps == []
+
+
+def test_turns_that_repeat_tell_no_clock():
+    frame = frame_of(axes=(0.0, 0.0, 0.5), rates=(1.0, 1.0, 2.0 * np.pi / 1.6))
+    assert against_gyro(lidar(), poses_of(frame, np.eye(3), 0.0), frame) is None
 
 
 def test_what_contradicts_the_rig_is_said():

@@ -76,6 +76,7 @@ def register(
     if found is not None:
         setup.calibration |= turning.calibrations(name, sensor, found)
         setup.warnings += [f"{name}: {line}" for line in turning.contradictions(name, sensor, found)]
+        setup.intervals += turning.since_steps(name, found, steps)
 
 
 def _of_points(points: Counter, sensor: Lidar) -> list[str]:
