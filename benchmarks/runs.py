@@ -38,6 +38,8 @@ DRAWN = {
     "hard_iron_ut": ("hard_iron_ut", 1.0),
     "tilt_n": ("tilt_deg", np.rad2deg(1.0)),
     "zero_m": ("offset_m", 1.0),
+    "xyz_m": ("mounting_m", 1.0),
+    "turn_deg": ("mounting_turn_deg", 1.0),
 }
 PARTS = {"rotation": 0, "position": 3, "velocity": 6, "bias_acc": 9, "bias_gyro": 12}  # where each begins in cov
 

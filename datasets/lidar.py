@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from datasets.simulate import START_NS, Scene, Sensed
 from datasets.worlds import Mesh
@@ -35,14 +36,16 @@ class Scans:
     """Scans of one LiDAR, cast anew in each iteration; header stamps are those of the scans' starts.
 
     Fields: x, y, z m and intensity (float32), ring (uint16), time (float32): s since the stamp. Rays without an echo
-    are not in the cloud. Dust after Beer and Lambert: light comes back over a range r with probability exp(-2 k r);
-    what does not was scattered on the way, and a share of it is an echo from there.
+    are not in the cloud. The LiDAR is at ``xyz_b`` (3,) m in b, ``R_bl`` takes its axes there. Dust after Beer and
+    Lambert: light comes back over a range r with probability exp(-2 k r); what does not was scattered on the way,
+    and a share of it is an echo from there.
     """
 
     topic: str
     since_ns: Times  # starts of the scans since the log's
     scene: Scene
-    sensor: Lidar
+    xyz_b: Floats
+    R_bl: Floats
     world: Mesh
     seed: int
     period_s: float
@@ -95,11 +98,11 @@ class Scans:
         nodes = max(2, int(np.ceil(np.ptp(t_s[0]) / NODE_S)) + 1)
         share = np.linspace(0.0, 1.0, nodes)
         truth = self.scene.motion((t_s[:, :1] + (t_s[:, -1:] - t_s[:, :1]) * share).ravel())
-        origin, _ = truth.at_point(self.sensor.T_bl.xyz)
+        origin, _ = truth.at_point(self.xyz_b)
         at = np.linspace(0.0, nodes - 1.0, t_s.shape[1])
         k = np.minimum(at.astype(int), nodes - 2)
         parts = []
-        for values in (origin.reshape(len(t_s), nodes, 3), (truth.R @ self.sensor.T_bl.R).reshape(len(t_s), nodes, 9)):
+        for values in (origin.reshape(len(t_s), nodes, 3), (truth.R @ self.R_bl).reshape(len(t_s), nodes, 9)):
             parts.append(values[:, k] + (at - k)[:, None] * (values[:, k + 1] - values[:, k]))
         return parts[0], parts[1].reshape(*t_s.shape, 3, 3)
 
@@ -137,14 +140,21 @@ def lidar(
     columns: int = 1800,
     dust: Dust | None = None,
 ) -> Sensed:
-    """Scans from the log's start to its end, 16 beams of ``columns`` points each; the mounting is as the rig says."""
+    """Scans from the log's start to its end, 16 beams of ``columns`` points each.
+
+    The mounting is the rig's plus errors drawn from its standard deviations: ``xyz_m``, and ``turn_deg``, a rotation
+    vector about the axes that the rig gives the LiDAR.
+    """
     count = int(scene.duration_s * rate_hz + 1e-6)
     since_ns = np.round(np.arange(count) * (NS / rate_hz)).astype(np.int64)
+    seed, (shift, turn) = int(rng.integers(2**63)), rng.standard_normal((2, 3))
+    drawn = {"xyz_m": sensor.T_bl.xyz + sensor.xyz_sd * shift, "turn_deg": np.rad2deg(sensor.rpy_sd) * turn}
+    R_bl = sensor.T_bl.R @ Rotation.from_rotvec(drawn["turn_deg"], degrees=True).as_matrix()
     scans = Scans(
-        sensor.topic, since_ns, scene, sensor, world, int(rng.integers(2**63)), 1 / rate_hz, columns, dust=dust,
+        sensor.topic, since_ns, scene, drawn["xyz_m"], R_bl, world, seed, 1 / rate_hz, columns, dust=dust,
         offset_ns=round(sensor.clock_offset_s * NS), counts=StreamCounts(received=count),
     )  # fmt: skip
-    return Sensed(scans, replace(scans, sigma_m=0.0, dust=None, offset_ns=0))
+    return Sensed(scans, replace(scans, sigma_m=0.0, dust=None, offset_ns=0), drawn)
 
 
 def raycasting(world: Mesh):

@@ -8,6 +8,7 @@ import datasets
 from datasets.tbm import START
 from datasets.tbm_roadway import DUSTY_M
 from tbmfg.errors import TbmfgError
+from tbmfg.geometry import exp_so3
 from tbmfg.mcap import read_log
 
 SMALL = {"columns": 60, "imu_rate_hz": 50.0}
@@ -44,6 +45,28 @@ def test_points_lie_on_the_walls_seen_from_their_own_times():
     assert height_over_walls(in_n(simulation, own, xyz(fields))).max() < 1e-3
     # a roadheader at 0.5 m/s, swaying: the scan's start is the wrong pose by millimetres at least
     assert height_over_walls(in_n(simulation, start_s, xyz(fields))).max() > 5e-3
+
+
+def test_the_mounting_is_drawn_from_the_rigs_prior_and_nothing_else_changes():
+    exact, loose = (
+        tunnel(1.0),
+        tunnel(1.0, settings=("sensors.lidar.T_bl_xyz_sd_m=0.1", "sensors.lidar.T_bl_rpy_sd_deg=2")),
+    )
+    mounting, drawn = exact.rig.sensors["lidar"].T_bl, loose.drawn["lidar"]
+    assert_array_equal(exact.drawn["lidar"]["xyz_m"], mounting.xyz)
+    assert_array_equal(exact.drawn["lidar"]["turn_deg"], np.zeros(3))
+    assert_array_equal(exact.clouds[0].R_bl, mounting.R)
+    assert 0.01 < np.linalg.norm(drawn["xyz_m"] - mounting.xyz) < 0.5
+    assert 0.2 < np.linalg.norm(drawn["turn_deg"]) < 10.0
+    for a, b in zip(exact.log_series, loose.log_series, strict=True):
+        assert all(np.array_equal(a[name], b[name]) for name in a.columns)
+    # the same walls from the drawn place: the floor lies where it was
+    truth, R_bl = loose.truth(np.zeros(1)), mounting.R @ exp_so3(np.radians(drawn["turn_deg"]))
+    _, fields = next(iter(loose.clean["lidar"]))
+    first = fields["time"] < 1e-3
+    points_n = truth.position + (xyz(fields)[first] @ R_bl.T + drawn["xyz_m"]) @ truth.R[0].T
+    low = points_n[points_n[:, 2] < START[2] - 0.05 + 1.4]
+    assert np.minimum(np.abs(np.abs(low[:, 1]) - 2.5), np.abs(low[:, 2] - (START[2] - 0.05))).max() < 5e-3
 
 
 def test_scans_repeat_and_a_clean_one_has_no_noise():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import datasets
-from benchmarks.runs import in_memory, true_states
+from benchmarks.runs import calibration_z, in_memory, true_states
 from tbmfg.errors import LogError
 from tbmfg.estimators import estimate
 from tbmfg.evaluation.metrics import trajectory_errors
@@ -320,6 +320,27 @@ def test_steps_join_the_graph():
     errors = trajectory_errors(result.trajectory, truth)
     # 6 dof; a draw of a chi-square of 6 beyond 30 has a chance of 4e-5
     assert errors.nees[-1] < 30.0
+
+
+def test_the_mounting_is_found_within_its_sd():
+    scores, settings = [], ("sensors.lidar.T_bl_xyz_sd_m=0.1", "sensors.lidar.T_bl_rpy_sd_deg=5")
+    for seed in range(3):
+        simulation = datasets.make(
+            "tbm-roadway",
+            seed=seed,
+            duration=24.0,
+            columns=120,
+            imu_rate_hz=200.0,
+            lidar_rate_hz=5.0,
+            settings=settings,
+        )
+        result = estimate("batch", prepare(in_memory(simulation), simulation.rig))
+        z = calibration_z(simulation, result)
+        scores += [score for name, score in z.items() if name.startswith("lidar_")]
+        assert min(result.calibration["lidar_mounting_turn_deg"].sd) < 2.0  # the log has told it
+    assert len(scores) == 18
+    # chi-square of 18, in 1 of 10^4 cases beyond 48
+    assert np.sum(np.square(scores)) < 48.0
 
 
 def test_scans_without_a_mounting_or_times_are_said():
