@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import binary_closing, median_filter
 
 from tbmfg.chance import chi_square_beyond, poisson_at_least
+from tbmfg.geometry import log_so3
 from tbmfg.problem import CLOCK, GATE, Problem
 from tbmfg.rig import kind_of
 from tbmfg.state import ROT, Innovations, Interval, Trajectory
@@ -15,8 +15,6 @@ from tbmfg.timeseries import Floats
 
 UNOBSERVED = 0.9  # posterior over prior sd from which a calibration counts as not observed
 VAGUE_HEADING = np.deg2rad(10.0)
-BIASED = 3.0  # sds to one side from which a sensor is called biased
-MEDIAN_ROWS = 9  # of the running median that judges it
 STRETCH = 3  # gated rows in a row from which a stretch of them is worth naming
 CHANCE = 1e-3  # with which rows that are as good as the rig says would look as bad
 
@@ -39,7 +37,7 @@ def unobserved(problem: Problem, path: Trajectory, sd: Floats) -> list[str]:
         elif not observed(sd[k], parameters.sd[k]):
             lines.append(
                 f"{parameters.names[k]} is not observable on this log: its sd stays "
-                f"{sd[k] / parameters.sd[k]:.0%} of the prior's; {_motion(path, what)}"
+                f"{sd[k] / parameters.sd[k]:.0%} of the prior's; {motion(path, what)}"
             )
     return lines
 
@@ -62,7 +60,7 @@ def _depth(problem: Problem, path: Trajectory, sensor: str, what: str, sd: float
     return [f"{sensor}: depth is limited by {line}; {remedy}, gnss or a prism would tell it"]
 
 
-def _motion(path: Trajectory, what: str) -> str:
+def motion(path: Trajectory, what: str) -> str:
     """The motion that shows a calibration, as far as the machine made it."""
     R = path.rotations()
     seconds = (path.t_ns[-1] - path.t_ns[0]) * 1e-9
@@ -76,10 +74,30 @@ def _motion(path: Trajectory, what: str) -> str:
     speed = np.linalg.norm(path.velocity_n, axis=1)
     if what in CLOCK:
         return f"an offset shows in changes of speed, and the machine was never faster than {speed.max():.2g} m/s"
+    turned = np.rad2deg(np.linalg.norm(log_so3(R[0].T @ R), axis=1).max())
     way = float(np.sum(np.linalg.norm(np.diff(path.position_n, axis=0), axis=1)))
-    return (
-        f"it shows in distances between known places or headings, and the machine went {way:.1f} m in {seconds:.0f} s"
+    went, turns = f"it went {way:.1f} m in {seconds:.0f} s", f"it turned by {turned:.1f} deg at most"
+    kind = what.partition("_")[0]
+    return ADVICE.get(kind, "it shows in motion that the machine did not make; {went}, {turns}").format(
+        went=went, turns=turns
     )
+
+
+# By kind of calibration: what would have shown it, and what the machine did.
+ADVICE = {
+    "scale": "it shows in distances between places that another sensor knows, and {went}",
+    "yaw": "the wheel's direction shows in the course between fixes, and {went}",
+    "pitch": "the wheel's direction shows in the course between fixes, and {went}",
+    "declination": "it shows against a heading from elsewhere: a course under fixes, initial.yaw_deg or gyrocompassing "
+    "at rest; {went}",
+    "iron": "the machine's own field turns with it, the Earth's does not: turn it about all axes, full circles first; "
+    "{turns}",
+    "mount": "the LiDAR's place shows where the machine turns, about two axes at least; {turns}",
+    "turn": "the LiDAR's axes show in turns about two axes at least, one leaves the angle about itself open; {turns}",
+    "tilt": "the line's tilt shows in how the spot moves over a long way along the line while the position is known "
+    "otherwise; {went}",
+    "offset": "the spot's zero turns with the machine, the line does not: it shows in turns about the line; {turns}",
+}
 
 
 def vague_heading(path: Trajectory) -> list[str]:
@@ -108,38 +126,6 @@ def gated_stretches(innovations: dict[str, Innovations]) -> list[Interval]:
             if last - first + 1 >= STRETCH:
                 found.append(Interval(sensor, "gated", int(series.t_ns[first]), int(series.t_ns[last])))
     return found
-
-
-def biased_stretches(problem: Problem, x: Floats, c: Floats) -> list[tuple[Interval, float]]:
-    """Times in which a sensor of one number lay BIASED sds or more to one side of the estimate at the keyframe states
-    ``x`` (n, 21 + e) and calibrations ``c``, and by how much in its unit: the running median says so, which
-    neither noise (0.4 sd) nor single spikes move."""
-    found = []
-    for rows in problem.rows:
-        if rows.dof > 1 or len(rows) < MEDIAN_ROWS:
-            continue
-        residual = rows.evaluate(x, c)[0][:, 0]
-        median = median_filter(residual, MEDIAN_ROWS, mode="nearest")
-        t_ns = problem.t_ns[rows.j]
-        for sign in (1.0, -1.0):
-            far = binary_closing(np.pad(sign * median > BIASED, MEDIAN_ROWS), np.ones(MEDIAN_ROWS))
-            edges = np.flatnonzero(np.diff(far[MEDIAN_ROWS - 1 : 1 - MEDIAN_ROWS].astype(int)))
-            for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
-                if last - first < MEDIAN_ROWS // 2:
-                    continue  # a bias long enough to move the median keeps it there longer
-                size = float(np.median((residual * rows.sigma[:, 0])[first : last + 1]))
-                found.append((Interval(rows.sensor, "biased", int(t_ns[first]), int(t_ns[last])), size))
-    return sorted(found, key=lambda one: one[0].start_ns)
-
-
-def biased_in_words(biased: list[tuple[Interval, float]], origin_ns: int) -> list[str]:
-    """One line per stretch."""
-    lines = []
-    for stretch, size in biased:
-        start, end = (stretch.start_ns - origin_ns) * 1e-9, (stretch.end_ns - origin_ns) * 1e-9
-        by = f"{np.rad2deg(size):+.1f} deg" if kind_of(stretch.sensor) == "magnetometer" else f"{size:+.2g} m"
-        lines.append(f"{stretch.sensor}: biased by {by} from {start:.1f} to {end:.1f} s against all else")
-    return lines
 
 
 def gated_in_words(innovations: dict[str, Innovations], stretches: list[Interval], origin_ns: int) -> list[str]:

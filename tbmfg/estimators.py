@@ -75,7 +75,7 @@ def batch(problem: Problem, progress: Progress) -> Result:
 
     f = filter_.run(problem, progress=lambda share: progress(0.3 * share))
     s = smoother.solve(problem, f.x, f.c, progress=lambda share: progress(0.3 + 0.7 * share))
-    out = result(problem, "batch", s.x, s.cov, s.c, s.c_cov, s.nis, beyond_gate(problem, s.nis))
+    out = result(problem, "batch", s.x, s.cov, s.c, s.c_cov, s.nis, beyond_gate(problem, s.nis), last_x=s.x)
     last = len(problem.keyframe_edges) - 1
     if not s.converged:
         _mark(problem, out, "batch", "unconverged", 0, last)
@@ -109,7 +109,8 @@ def _online(problem: Problem, name: str, online: Online) -> Result:
     from tbmfg.outcome import beyond_gate, result, trajectory
 
     gated = beyond_gate(problem, online.nis)
-    out = result(problem, name, online.causal_x, online.causal_cov, online.c, online.c_cov, online.nis, gated)
+    states, constants = (online.causal_x, online.causal_cov), (online.c, online.c_cov)
+    out = result(problem, name, *states, *constants, online.nis, gated, last_x=online.last_x)
     out.smoothed = trajectory(problem, online.last_x, online.last_cov)
     t_s, end = problem.keyframes_s, len(problem.keyframe_edges) - 1
     for restart in online.restarts:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tbmfg import diagnosis
+from tbmfg import diagnosis, residuals
 from tbmfg.chance import chi_square_point
 from tbmfg.geometry import exp_so3, quat_from_matrix, rpy_from_rotation
 from tbmfg.problem import CLOCK, GATE, Problem
@@ -60,14 +60,17 @@ def result(
     nis: dict[str, Floats],
     gated: dict[str, np.ndarray],
     row_times_ns: Times | None = None,
+    last_x: Floats | None = None,
 ) -> Result:
     """What an estimator returns, from its states, calibrations ``c`` (m,) with covariance, and rows' NIS and gates.
 
-    The problem's rows lie at keyframes, or, if ``row_times_ns`` is given, at these stamps.
+    The problem's rows lie at keyframes, or, if ``row_times_ns`` is given, at these stamps. ``last_x`` (n, 21 + e): the
+    last estimates, that know the whole log or much of it, where there are any.
     """
     path = trajectory(problem, x, cov)
     sd = np.sqrt(np.maximum(np.diag(c_cov), 0.0))
-    biased = diagnosis.biased_stretches(problem, x, c) if row_times_ns is None else []
+    at = x if last_x is None else last_x
+    biased = residuals.biased(problem, at, c, causal=last_x is None) if row_times_ns is None else []
     row_times_ns = path.t_ns if row_times_ns is None else row_times_ns
     innovations = {
         rows.sensor: Innovations(row_times_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
@@ -80,13 +83,13 @@ def result(
         calibration={**calibrations(problem, c, sd), **_drifts(problem, x, cov)},
         counts=_counts(problem, gated),
         innovations=innovations,
-        intervals=[*problem.intervals, *stretches, *(stretch for stretch, _ in biased)],
+        intervals=[*problem.intervals, *stretches, *(one.stretch for one in biased)],
         warnings=[
             *diagnosis.unobserved(problem, path, sd),
             *diagnosis.vague_heading(path),
             *diagnosis.gated_in_words(innovations, stretches, problem.t0_ns),
             *diagnosis.gated_together(stretches, problem.t0_ns),
-            *diagnosis.biased_in_words(biased, problem.t0_ns),
+            *residuals.biased_in_words(biased, problem.t0_ns),
         ],
     )
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tbmfg.diagnosis import gated_in_words, gated_stretches, gated_together
+from tbmfg.diagnosis import gated_in_words, gated_stretches, gated_together, motion
 from tbmfg.estimators import estimate
+from tbmfg.geometry import quat_from_matrix, rotation_z
 from tbmfg.prepare import prepare
 from tbmfg.results import summarise
-from tbmfg.state import Innovations, Interval
+from tbmfg.state import Innovations, Interval, Trajectory
 from tests import problems
 
 
@@ -46,6 +47,34 @@ def test_sensors_gated_together_point_at_the_imu():
     assert gated_together([stretch("prism", 1, 5), stretch("odometer", 6, 8)], 0) == []
     [line] = gated_together([stretch("prism", 2, 9), stretch("odometer", 4, 6), stretch("magnetometer", 5, 8)], 10**9)
     assert line.startswith("imu: magnetometer and odometer and prism are gated together from 3.0 to 7.0 s")
+
+
+@pytest.mark.parametrize(
+    ("what", "advice", "did"),
+    [
+        ("arm_z", "across the axes that the machine turns about", "90.0 deg about the vertical"),
+        ("clock_offset", "in changes of speed", "never faster than 2 m/s"),
+        ("scale", "in distances between places", "20.0 m in 10 s"),
+        ("yaw", "in the course between fixes", "20.0 m in 10 s"),
+        ("declination", "against a heading from elsewhere", "20.0 m in 10 s"),
+        ("iron_y", "turn it about all axes", "turned by 90.0 deg at most"),
+        ("mount_x", "where the machine turns, about two axes", "turned by 90.0 deg at most"),
+        ("turn_z", "in turns about two axes", "turned by 90.0 deg at most"),
+        ("tilt_x", "over a long way along the line", "20.0 m in 10 s"),
+        ("offset_y", "in turns about the line", "turned by 90.0 deg at most"),
+        ("of_somebody_else", "in motion that the machine did not make", "20.0 m in 10 s"),
+    ],
+)
+def test_each_calibration_is_told_the_motion_that_shows_it(what, advice, did):
+    t_s = np.linspace(0.0, 10.0, 101)
+    nothing, R = np.zeros((101, 3)), np.array([rotation_z(np.pi / 20 * t) for t in t_s])
+    way = np.stack([2.0 * t_s, *nothing.T[:2]], axis=1)
+    speed = np.tile([2.0, 0.0, 0.0], (101, 1))
+    t_ns = (t_s * 1e9).astype(np.int64)
+    path = Trajectory(t_ns, way, quat_from_matrix(R), speed, nothing, nothing, np.zeros((101, 15, 15)))
+    words = motion(path, what)
+    assert advice in words
+    assert did in words
 
 
 def test_an_arm_that_cannot_be_seen_is_explained_by_the_motion():

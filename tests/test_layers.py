@@ -19,7 +19,7 @@ LEVELS = (
     ("sensors", "mcap", "inertial", "lidar", "evaluation"),
     ("measure", "gnss", "results", "comparison"),
     ("problem", "inference", "dual"),
-    ("filters", "smoother", "diagnosis", "given"),
+    ("filters", "smoother", "diagnosis", "residuals", "given"),
     ("outcome",),
     ("prepare",),
     ("estimators", "bounds", "report", "mapping"),

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import datasets
-from tbmfg.diagnosis import BIASED
 from tbmfg.estimators import estimate
 from tbmfg.geometry import log_so3
 from tbmfg.prepare import prepare
+from tbmfg.residuals import BIASED
 from tests.problems import log_of, true_states
 
 SECONDS = 40.0  # the fault lasts from 10 to 30 s
