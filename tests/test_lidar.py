@@ -324,7 +324,7 @@ def test_steps_join_the_graph():
 
 def test_the_mounting_is_found_within_its_sd():
     scores, settings = [], ("sensors.lidar.T_bl_xyz_sd_m=0.1", "sensors.lidar.T_bl_rpy_sd_deg=5")
-    for seed in range(3):
+    for seed in range(2):
         simulation = datasets.make(
             "tbm-roadway",
             seed=seed,
@@ -338,9 +338,9 @@ def test_the_mounting_is_found_within_its_sd():
         z = calibration_z(simulation, result)
         scores += [score for name, score in z.items() if name.startswith("lidar_")]
         assert min(result.calibration["lidar_mounting_turn_deg"].sd) < 2.0  # the log has told it
-    assert len(scores) == 18
-    # chi-square of 18, in 1 of 10^4 cases beyond 48
-    assert np.sum(np.square(scores)) < 48.0
+    assert len(scores) == 12
+    # chi-square of 12, in 1 of 10^4 cases beyond 39
+    assert np.sum(np.square(scores)) < 39.0
 
 
 def test_scans_without_a_mounting_or_times_are_said():
@@ -387,7 +387,6 @@ def test_a_turn_that_nobody_foretold_is_found():
     R = exp_so3(np.array([0.0, 0.0, np.deg2rad(50.0)]))
     pose = odometry.register(clouds.Scan(0, room(rng, 6000) @ R, None, 0, 0, 0), 3.0)
     assert pose.healthy
-    assert odometry.sought == 1
     assert_allclose(pose.R, R, atol=0.01)
 
 

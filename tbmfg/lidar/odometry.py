@@ -8,7 +8,7 @@ information of the others. The map of both is made of the refined poses.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +122,7 @@ class Odometry:
         self.velocity_0, self.rate_l = np.zeros(3), np.zeros(3)
         self.usual, self.slides = Usual(), Slides()
         self.last: Pose | None = None
-        self.unfit = self.restarts = self.sought = self.scans = 0
+        self.unfit = self.restarts = self.scans = 0
 
     def register(self, scan: Scan, start_s: float) -> Pose | None:
         """The pose of a scan whose stamp is ``start_s`` s; None for one of too few points."""
@@ -143,7 +143,6 @@ class Odometry:
         slide_m = self.motion.slide(self.last.t_s, t_s)
         found = self._align(source, prior, prior, slide_m)
         if self.usual.falls_short(found.overlap):
-            self.sought += 1
             found = max([found, *self._sought_anew(source, prior, slide_m)], key=lambda one: one.support)
         deviation = np.linalg.inv(matrix(*prior)) @ matrix(found.R, found.p)
         self.kiss.adaptive_threshold.update_model_deviation(deviation)
@@ -226,13 +225,6 @@ class Odometry:
         self.velocity_0 = R_0[0] @ velocity_l
 
 
-def run(scans: Iterable[tuple[Scan, float]], sensor: Lidar, motion: Inertia | Blind) -> Iterator[Pose | None]:
-    """Poses of scans with their stamps in s, one by one; None for scans that cannot be registered."""
-    odometry = Odometry(sensor, motion)
-    for scan, start_s in scans:
-        yield odometry.register(scan, start_s)
-
-
 def slides(weak: Floats) -> Floats:
     """Orthonormal directions (3, j) in which the LiDAR can slide without a turn, of ``weak`` ones (6, k)."""
     span = np.linalg.qr(np.repeat([FAR_M, 1.0], 3)[:, None] * weak)[0]
@@ -254,8 +246,3 @@ def matrix(R: Floats, p: Floats) -> Floats:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, p
     return T
-
-
-def error(R: Floats, p: Floats, R_true: Floats, p_true: Floats) -> Floats:
-    """Right perturbation [rotation, position] from a true pose to another, (6,)."""
-    return np.concatenate([log_so3(R_true.T @ R), R_true.T @ (p - p_true)])
