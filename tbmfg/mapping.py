@@ -38,10 +38,11 @@ SKETCH_M, SKETCH_SCANS, SKETCH_POINTS = 0.2, 600, 5000  # of a sketch: a point a
 @dataclass(frozen=True, slots=True)
 class Sharpness:
     """How sharp a map is: ``thickness_m``, the median sd of the points across the surface in a voxel of 0.25 m, and
-    ``entropy``, the mean of ln det(2 pi e C) / 2 over the same voxels (Droeschel, Behnke 2014). Ghosts raise both."""
+    ``entropy``, the mean of ln det(2 pi e C) / 2 over the same voxels (Droeschel, Behnke 2014). Ghosts raise both. None
+    of a map without such ``voxels``: it is too thin to judge."""
 
-    thickness_m: float
-    entropy: float
+    thickness_m: float | None
+    entropy: float | None
     voxels: int
 
 
@@ -207,12 +208,13 @@ def _thinned(o3d, cloud, scans: list[Floats]):
 
 
 def sharpness(blur: SurfelMap) -> Sharpness:
-    """Of the points in a map that took them all; voxels that hold a surface, thick or thin, count alike."""
+    """Of the points in a map that took them all; voxels that hold a surface, thick or thin, count alike. Of a map
+    without such a voxel there is nothing to tell."""
     cov = blur.covariances(LEAST)
     value = np.linalg.eigvalsh(cov)
     value = np.maximum(value[value[:, 1] > (0.15 * blur.voxel) ** 2], 1e-12)
     if not len(value):
-        raise TbmfgError("the map is too thin to judge: no voxel of 0.25 m holds a surface")
+        return Sharpness(None, None, 0)
     entropy = 0.5 * np.sum(np.log(2 * np.pi * np.e * value), axis=1)
     return Sharpness(float(np.median(np.sqrt(value[:, 0]))), float(entropy.mean()), len(value))
 

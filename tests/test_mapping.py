@@ -202,6 +202,26 @@ def test_what_cannot_be_mapped(made, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_thin_log_gives_a_thin_map(tmp_path):
+    simulation = datasets.make("tbm-roadway", seed=3, duration=1.5, columns=2, imu_rate_hz=200.0)
+    simulation.write(tmp_path / "log.mcap")
+    path = truth_path(simulation)
+    short = Trajectory(**{name: getattr(path, name)[:15] for name in Trajectory.__slots__})
+    save(tmp_path / "truth", short, simulation.rig_text)
+    made = mapping.make(str(tmp_path / "log.mcap"), tmp_path / "truth", tmp_path / "map.ply")
+    assert made.sharpness == mapping.Sharpness(None, None, 0)
+    assert 1 < len(made.points) < 600
+    assert (tmp_path / "map.ply").is_file()
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("points", [[[1.0, 2.0, 3.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, -500.0]]])
+def test_pictures_of_few_points_are_bounded(points):
+    image = raster.picture(np.array(points), np.zeros((2, 3)))
+    assert image.shape[0] < 10 * raster.WIDTH
+    assert (image < 255).any()
+
+
 def test_picture_holds_the_points_and_the_path():
     points = np.array([[0.0, 0.0, 0.0], [10.0, 1.0, 0.0], [10.0, 0.0, 2.0]])
     image = raster.picture(points, np.array([[0.0, 0.5, 1.0], [10.0, 0.5, 1.0]]))

@@ -88,13 +88,18 @@ def map_(
     if not keep_air:
         out.say(f"{made.in_air} of {made.returns} returns ({made.in_air / made.returns:.1%}) hang in the air, as dust")
         out.say("does: most rays through their place went on; they are left out")
-    out.say(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
-    out.say(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
+    if not sharp.voxels:
+        out.say(
+            f"{points} points; too thin to judge how sharp it is: no voxel of {mapping.THICK_M:g} m holds a surface"
+        )
+    else:
+        out.say(f"{points} points; surfaces are {1e3 * sharp.thickness_m:.1f} mm thick (median of {sharp.voxels}")
+        out.say(f"voxels of {mapping.THICK_M:g} m), mean map entropy {sharp.entropy:.2f}")
     out.say(f"map: {output}, picture: {picture}; made along {trajectory}/{made.along}.npz")
     out.data(
         {"map": output, "picture": picture, "points": points, "returns": made.returns, "in_air": made.in_air}
         | {"along": made.along}
-        | asdict(sharp)
+        | (asdict(sharp))
     )
 
 

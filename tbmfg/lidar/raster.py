@@ -10,6 +10,7 @@ import numpy as np
 from tbmfg.timeseries import Floats
 
 WIDTH = 1600
+TALLEST = 4  # times as high as wide is a view at most
 GAP = 20
 FAINTEST = 0.5  # shade of a single point: what was seen once is to be seen
 PATH = (230, 60, 40)
@@ -22,11 +23,11 @@ def picture(points: Floats, path: Floats) -> np.ndarray:
     low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
     along = int(np.argmax((high - low)[:2]))
     across = 1 - along
-    scale = WIDTH / max(high[along] - low[along], 1e-6)
+    scale = (WIDTH - 1) / max(high[along] - low[along], (high - low).max() / TALLEST, 1e-6)
     shade = np.clip((points[:, 2] - low[2]) / max(high[2] - low[2], 1e-6), 0.0, 1.0)
     views = []
     for axis in (across, 2):
-        height = max(2, int(np.ceil((high[axis] - low[axis]) * scale)))
+        height = max(2, int((high[axis] - low[axis]) * scale) + 1)
         views.append(_view(points, path, shade, (along, axis), low, scale, height))
         views.append(np.full((GAP, WIDTH, 3), 255, dtype=np.uint8))
     return np.vstack(views[:-1])
