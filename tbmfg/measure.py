@@ -192,12 +192,12 @@ def magnetometer_rows(
     fields: Samples,
     keyframes_s: Floats,
     frame: GyroFrame,
-    R_start: Floats,
     x_axis_azimuth: float,
     calib: slice,
+    horizontal: float = 0.0,
 ) -> Rows:
     """Fields averaged to the nearest keyframe, carried there by the gyro, and where the machine's own is to be found,
-    with them the sensor's axes and the Earth's horizontal one; ``R_start`` (3, 3) the attitude at the start."""
+    with them the sensor's axes and the length of the ``horizontal`` field [T] that the rig's sigma belongs to."""
     t = fields.t_s - sensor.clock_offset
     k = nearest(keyframes_s, t)
     axes = frame.at(t) @ sensor.R_bm
@@ -211,21 +211,29 @@ def magnetometer_rows(
     lasting = sensor.disturbance**2 * _dependence(keyframes_s, sensor.disturbance_time)[used]
     sigma = np.sqrt(sensor.sigma**2 / count + lasting)[:, None]
     if sensor.hard_iron_sd_ut:
-        begin = t < t[0] + LEVEL_S
-        H = _horizontal_field(axes[begin], carried[begin], R_start[2], sensor)
-        model, data = "magnetic_field", np.column_stack([data, own, np.full(len(used), H)])
+        model, data = "magnetic_field", np.column_stack([data, own, np.full(len(used), horizontal)])
     return Rows(fields.sensor, model, used, used, z, data, sigma, calib, count, sensor.loss)
 
 
-def _horizontal_field(axes: Floats, carried: Floats, up: Floats, sensor: Magnetometer) -> float:
-    """Length of the Earth's horizontal field [T]: ``carried`` (n, 3), in a frame that does not turn, is the Earth's and
-    the sensor's ``axes`` (n, 3, 3) times an own one with the rig's prior; ``up`` (3,) in that frame. Where the machine
-    does not turn, it is wrong by as much as the own one is long."""
-    noise = sensor.sigma * float(np.median(np.linalg.norm(carried - np.outer(carried @ up, up), axis=1)))
+def horizontal_field(
+    sensor: Magnetometer, fields: Samples, frame: GyroFrame, R_start: Floats, tilt_sd: float
+) -> tuple[float, float]:
+    """Length of the Earth's horizontal field and its sd [T], by the attitude at the start ``R_start`` (3, 3), known to
+    ``tilt_sd`` [rad]. Carried there by the gyro, the fields are the Earth's and the sensor's axes times an own one with
+    the rig's prior: where the machine does not turn, the sd is that prior's."""
+    t = fields.t_s - sensor.clock_offset
+    begin = t < t[0] + LEVEL_S
+    axes = R_start @ frame.at(t[begin]) @ sensor.R_bm
+    field_n = np.einsum("nij,nj->ni", axes, fields.values[begin] - sensor.hard_iron)
+    noise = sensor.sigma * float(np.median(np.hypot(field_n[:, 0], field_n[:, 1])))
     A = np.concatenate([np.tile(np.eye(3), (len(axes), 1, 1)), axes], axis=2).reshape(-1, 6)
     prior = np.diag([0.0] * 3 + [(noise / sensor.hard_iron_sd) ** 2] * 3)
-    earth_0 = np.linalg.solve(A.T @ A + prior, A.T @ carried.ravel())[:3]
-    return float(np.linalg.norm(earth_0 - up * (earth_0 @ up)))
+    cov = np.linalg.inv(A.T @ A + prior)
+    earth_n = (cov @ A.T @ field_n.ravel())[:3]
+    H = float(np.hypot(earth_n[0], earth_n[1]))
+    along = earth_n[:2] / H
+    variance = noise**2 * along @ cov[:2, :2] @ along + (earth_n[2] * tilt_sd) ** 2
+    return H, float(np.sqrt(variance))
 
 
 def laser_rows(

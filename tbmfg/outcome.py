@@ -12,7 +12,7 @@ import numpy as np
 from tbmfg import diagnosis, residuals
 from tbmfg.chance import chi_square_point
 from tbmfg.geometry import exp_so3, quat_from_matrix, rpy_from_rotation
-from tbmfg.problem import CLOCK, GATE, Problem
+from tbmfg.problem import CLOCK, GATE, STRENGTH, Problem
 from tbmfg.rig import Rig
 from tbmfg.state import NAV, Calibrated, Counts, Innovations, Result, Trajectory
 from tbmfg.timeseries import Floats, Times
@@ -28,6 +28,7 @@ PUBLIC = {
     "yaw": (2, "mounting_yaw_pitch_deg", DEG),
     "declination": (1, "declination_deg", DEG),
     "iron_x": (3, "hard_iron_ut", 1.0),
+    STRENGTH: (1, "horizontal_field_ut", 1.0),
     "mount_x": (3, "mounting_m", 1.0),
     "turn_x": (3, "mounting_turn_deg", DEG),
     "tilt_x": (2, "tilt_deg", DEG),

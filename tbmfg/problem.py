@@ -18,6 +18,7 @@ from tbmfg.state import NAV, Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats, Times
 
 CLOCK = ("clock_offset", "clock_drift")  # parameters that say when a row was measured
+STRENGTH = "strength"  # the parameter of a magnetometer that is the Earth's horizontal field [microtesla]
 BREAKDOWN = (ArithmeticError, RuntimeError, np.linalg.LinAlgError)  # what numpy, compiled code and GTSAM fail with
 GATE = 0.999  # probability inside a gate: rows beyond this chi-square point are counted as gated
 
@@ -44,6 +45,10 @@ class Parameters:
         """Where the calibrations of ``sensor`` lie."""
         own = [k for k, name in enumerate(self.names) if name.rpartition(".")[0] == sensor]
         return slice(own[0], own[-1] + 1) if own else slice(0, 0)
+
+    def prior(self, name: str) -> float:
+        """The prior mean of one, 0 where there is none of that name."""
+        return float(self.mean[self.names.index(name)]) if name in self.names else 0.0
 
 
 @dataclass(frozen=True, slots=True)

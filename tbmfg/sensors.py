@@ -196,31 +196,41 @@ def magnetometer(z, data, xi, xj, c):
 
 @njit(cache=True)
 def magnetic_field(z, data, xi, xj, c):
-    """How far across north the horizontal magnetic field lies, for a machine that has a field of its own to be found.
+    """Direction of the horizontal magnetic field, against that of the Earth's and the machine's own, to be found.
 
     z (3): field in b [T]. data (11): angle of magnetic north in n [rad], then C (9, row by row), which takes the own
-    field from the sensor's axes, microtesla, to what it adds to z, then the Earth's horizontal field H [T]. c (4):
-    error of the declination [rad] and what of the own field is not yet subtracted [microtesla]. Of what is left, h,
-    the residual is |h| / H times the angle of :func:`magnetometer`.
+    field from the sensor's axes, microtesla, to what it adds to z, then the length [T] that counts as one. c (5): error
+    of the declination [rad], what of the own field is not yet subtracted, and the Earth's horizontal field H
+    [microtesla]. With h measured and p the sum of both fields, horizontally, the residual is the angle from p to h
+    times |h|.
 
-    Noise turns a short field more than a long one: an angle alone would be least for an own field that makes h long.
+    Noise turns a long field less than a short one, hence |h|: of what was measured. Taken off the measurement, the own
+    field would be favoured that makes the rest long; and noise would get into what tells it from the declination, which
+    on a machine that turns little is not much.
     """
     n, d = len(z), xi.shape[1] - 6
-    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 4))
+    r, Ji, Jc = np.empty((n, 1)), np.zeros((n, 1, d)), np.empty((n, 1, 5))
+    H = 1e-6 * c[4]
     for k in range(n):
-        C, H = data[k, 1:10].copy().reshape(3, 3), data[k, 10]
-        m = z[k] - C @ c[1:]
-        h, turn = _rotate(xi[k], m), np.zeros((3, 3))
-        _add_minus_R_skew(turn, xi[k], m, 1.0)
-        length = np.sqrt(h[0] * h[0] + h[1] * h[1])
-        angle = _wrapped(np.arctan2(h[1], h[0]) - data[k, 0] + c[0])
-        r[k, 0], Jc[k, 0, 0] = length / H * angle, length / H
-        # h changes along itself by a and across by b: |h| by a, the angle by b / |h|
-        along, across = (h[0] * angle - h[1]) / (length * H), (h[1] * angle + h[0]) / (length * H)
+        north, C, one = data[k, 0] - c[0], data[k, 1:10].copy().reshape(3, 3), data[k, 10]
+        own = C @ c[1:4]
+        h, p, turn, turn_p = _rotate(xi[k], z[k]), _rotate(xi[k], own), np.zeros((3, 3)), np.zeros((3, 3))
+        _add_minus_R_skew(turn, xi[k], z[k], 1.0)
+        _add_minus_R_skew(turn_p, xi[k], own, 1.0)
+        p[0] += H * np.cos(north)
+        p[1] += H * np.sin(north)
+        length, square = np.sqrt(h[0] * h[0] + h[1] * h[1]), p[0] * p[0] + p[1] * p[1]
+        share, angle = length / one, _wrapped(np.arctan2(h[1], h[0]) - np.arctan2(p[1], p[0]))
+        r[k, 0] = share * angle
+        Jc[k, 0, 0] = share * H * (p[0] * np.cos(north) + p[1] * np.sin(north)) / square
+        Jc[k, 0, 4] = -share * 1e-6 * (p[0] * np.sin(north) - p[1] * np.cos(north)) / square
         for b in range(3):
-            own = _rotate(xi[k], C[:, b])
-            Ji[k, 0, b] = along * turn[0, b] + across * turn[1, b]
-            Jc[k, 0, 1 + b] = -along * own[0] - across * own[1]
+            part = _rotate(xi[k], C[:, b])
+            Jc[k, 0, 1 + b] = -share * (p[0] * part[1] - p[1] * part[0]) / square
+            turned = (h[0] * turn[1, b] - h[1] * turn[0, b]) / (length * length)
+            turned -= (p[0] * turn_p[1, b] - p[1] * turn_p[0, b]) / square
+            longer = (h[0] * turn[0, b] + h[1] * turn[1, b]) / (length * one)
+            Ji[k, 0, b] = share * turned + longer * angle
     return r, Ji, np.zeros((n, 1, 0)), Jc
 
 

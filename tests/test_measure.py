@@ -140,7 +140,7 @@ def test_magnetometer_rows_average_what_belongs_to_a_keyframe(world):
     t_s = (clean.t_ns - frame.steps.t0_ns) * 1e-9 + 0.03
     keyframes = np.linspace(frame.steps.edges_s[0], frame.steps.end_s, 81)  # every 250 ms: five samples each
     rows = measure.magnetometer_rows(
-        sensor, Samples("magnetometer", t_s, clean["field"]), keyframes, frame, np.eye(3), np.radians(30.0), slice(0, 4)
+        sensor, Samples("magnetometer", t_s, clean["field"]), keyframes, frame, np.radians(30.0), slice(0, 4)
     )
     x = states(simulation, keyframes + zero_s, np.zeros(3))
     residual, *_ = rows.evaluate(x, np.array([declination, 0.0, 0.0, 0.0]))
@@ -161,29 +161,21 @@ def test_magnetometer_mounting_and_hard_iron():
     plain = Magnetometer(topic="/mag")
     mounted = Magnetometer(topic="/mag", hard_iron_ut=(5.0, -3.0, 8.0), rpy_deg=(10.0, 20.0, -50.0))
     as_measured = field @ mounted.R_bm + 1e-6 * np.array([5.0, -3.0, 8.0])
-    one = measure.magnetometer_rows(plain, Samples("m", t_s, field), keyframes, frame, np.eye(3), 0.5, slice(0, 1))
-    two = measure.magnetometer_rows(
-        mounted, Samples("m", t_s, as_measured), keyframes, frame, np.eye(3), 0.5, slice(0, 1)
-    )
+    one = measure.magnetometer_rows(plain, Samples("m", t_s, field), keyframes, frame, 0.5, slice(0, 1))
+    two = measure.magnetometer_rows(mounted, Samples("m", t_s, as_measured), keyframes, frame, 0.5, slice(0, 1))
     assert_allclose(two.z, one.z, atol=1e-18)
     # left in the readings and given as a calibration it comes to the same, however the body turns between keyframes
     unknown = mounted.model_copy(update={"hard_iron_ut": (0.0, 0.0, 0.0), "hard_iron_sd_ut": 5.0})
-    three = measure.magnetometer_rows(
-        unknown, Samples("m", t_s, as_measured), keyframes, frame, np.eye(3), 0.5, slice(0, 4)
-    )
+    three = measure.magnetometer_rows(unknown, Samples("m", t_s, as_measured), keyframes, frame, 0.5, slice(0, 4))
     own = three.data[:, 1:10].reshape(-1, 3, 3) @ [5.0, -3.0, 8.0]
     assert_allclose(three.z - own, one.z, atol=1e-18)
     # what does not turn with the body is the Earth's: 50 microtesla that dip by 65 degrees
-    level = measure.magnetometer_rows(
-        unknown,
-        Samples("m", t_s, as_measured),
-        keyframes,
-        frame,
-        simulation.truth(np.array([0.0])).R[0],
-        0.5,
-        slice(0, 4),
-    )
-    assert_allclose(level.data[:, 10], 50e-6 * np.cos(np.radians(65.0)), rtol=0.01)
+    R_start = simulation.truth(np.array([0.0])).R[0]
+    H, sd = measure.horizontal_field(unknown, Samples("m", t_s, as_measured), frame, R_start, 0.0)
+    assert_allclose(H, 50e-6 * np.cos(np.radians(65.0)), atol=3 * sd)
+    assert sd < 0.1 * 5e-6
+    _, doubted = measure.horizontal_field(unknown, Samples("m", t_s, as_measured), frame, R_start, 0.01)
+    assert_allclose(doubted**2 - sd**2, (0.01 * 50e-6 * np.sin(np.radians(65.0))) ** 2, rtol=0.05)
 
 
 def test_barometer_rows_hold_at_truth(world):
@@ -357,9 +349,7 @@ def test_what_disturbs_a_compass_does_not_average_away():
     sensor = Magnetometer(topic="/mag", sigma_deg=2.0, disturbance_deg=3.0, disturbance_s=1.0)
     for interval in (0.05, 0.25):
         keyframes = np.arange(0.0, 9.9, interval)
-        rows = measure.magnetometer_rows(
-            sensor, Samples("m", t_s, field["field"]), keyframes, frame, np.eye(3), 0.5, slice(0, 1)
-        )
+        rows = measure.magnetometer_rows(sensor, Samples("m", t_s, field["field"]), keyframes, frame, 0.5, slice(0, 1))
         expected = np.radians(np.sqrt(2.0**2 / rows.samples + 3.0**2 * 2.0 / interval))
         assert_allclose(rows.sigma[:, 0], expected, rtol=1e-9)
 

@@ -42,7 +42,7 @@ CASES = {
     "magnetic_field": (
         [1.4e-5, -1.7e-5, -3.1e-5],
         [0.4, *(1.3e-6 * R_BD).ravel(), 1.9e-5],
-        [0.05, 0.8, -0.5, 1.1],
+        [0.05, 0.8, -0.5, 1.1, 19.0],
         20.0,
     ),
     "barometer": ([11.2], [0.04, 1.0, 3.0, -2.0], [0.02, 1.3], 20.0),
@@ -63,7 +63,7 @@ CALIBRATIONS = {
     "odometer": ["scale", "yaw", "pitch"],
     "wheel": ["scale", "yaw", "pitch"],
     "magnetometer": ["declination"],
-    "magnetic_field": ["declination", "iron.x", "iron.y", "iron.z"],
+    "magnetic_field": ["declination", "iron.x", "iron.y", "iron.z", "strength"],
     "barometer": ["scale", "lapse"],
     "laser": ["tilt.x", "tilt.y", "offset.x", "offset.y"],
 }
@@ -252,14 +252,17 @@ def test_magnetometer_at_truth_and_across_the_branch_cut():
     direction = north - declination
     field_n = np.array([np.cos(dip) * np.cos(direction), np.cos(dip) * np.sin(direction), -np.sin(dip)])
     for turn in (0.0, 0.2, 1.0, -3.0):  # direction + turn passes +-pi
-        iron_ut, states = np.array([3.0, -8.0, 5.0]), (X_I[None], X_I[None])
+        states = X_I[None], X_I[None]
         field_b = R.T @ exp_so3(np.array([0.0, 0.0, turn])) @ field_n * 48e-6
         residual, *_ = sensors.magnetometer(field_b[None], np.array([[north]]), *states, np.array([declination]))
         assert residual[0, 0] == pytest.approx(turn, abs=1e-14)
-        field_b += R_BD @ iron_ut * 1e-6
-        data, c = [[north, *(1e-6 * R_BD).ravel(), 48e-6 * np.cos(dip)]], [declination, *iron_ut]
-        residual, *_ = sensors.magnetic_field(field_b[None], np.array(data), *states, np.array(c))
-        assert residual[0, 0] == pytest.approx(turn, abs=1e-14)
+        H, iron_ut = 48e-6 * np.cos(dip), np.array([3.0, -8.0, 5.0])
+        data, c = np.array([[north, *(1e-6 * R_BD).ravel(), 0.5 * H]]), np.array([declination, 0.0, 0.0, 0.0, 1e6 * H])
+        residual, *_ = sensors.magnetic_field(field_b[None], data, *states, c)
+        assert residual[0, 0] == pytest.approx(2.0 * turn, abs=1e-13)
+    c[1:4] = iron_ut
+    at_truth = R.T @ field_n * 48e-6 + R_BD @ iron_ut * 1e-6
+    assert sensors.magnetic_field(at_truth[None], data, *states, c)[0] == pytest.approx(0.0, abs=1e-14)
 
 
 def test_barometer_bound_and_velocity_at_truth():

@@ -26,13 +26,13 @@ import numpy as np
 from pydantic import Field
 from scipy.linalg import block_diag
 
-from tbmfg.fields import Flag, Node
+from tbmfg.fields import MICRO_TESLA, Flag, Node
 from tbmfg.filters import samplewise
 from tbmfg.filters.federated import Federation, Rule
 from tbmfg.filters.kalman import correct, innovation, innovation_noise
 from tbmfg.inertial.strapdown import correct_state, propagate
 from tbmfg.measure import GyroFrame, Samples, magnetometer_rows, wheel_rows
-from tbmfg.problem import Problem
+from tbmfg.problem import STRENGTH, Problem
 from tbmfg.rig import kind_of
 from tbmfg.sensors import Rows
 from tbmfg.state import NAV, ROT
@@ -103,12 +103,13 @@ class Filtered:
 def view(problem: Problem, design: Design) -> Problem:
     """The problem as a filter of ``design`` sees it: its own sensors' samples one by one, as rows at IMU edges."""
     edges_s, rig = problem.inertial.steps.edges_s, problem.rig
-    R_start, azimuth = problem.prior.x[:9].reshape(3, 3), rig.origin.x_axis_azimuth
+    azimuth = rig.origin.x_axis_azimuth
 
     def to_rows(name: str, s: Samples, frame: GyroFrame, calib: slice) -> Rows:
         if kind_of(name) == "odometer":
             return wheel_rows(rig.sensors[name], s, edges_s, frame, calib)
-        return magnetometer_rows(rig.sensors[name], s, edges_s, frame, R_start, azimuth, calib)
+        horizontal = MICRO_TESLA * problem.parameters.prior(f"{name}.{STRENGTH}")
+        return magnetometer_rows(rig.sensors[name], s, edges_s, frame, azimuth, calib, horizontal)
 
     return samplewise.view(problem, (kind for member in design.members for kind in member), to_rows)
 

@@ -59,7 +59,7 @@ def prepare(
         told = enhance.levelled(setup)
         for name in lidars:
             scans.register(log, name, setup, outages, lambda share: tell("LiDAR odometry", share))
-        setup.parameters = parameters_of(rig, setup.samples)
+        setup.parameters = parameters_of(rig, setup.samples, setup.frame, setup.R_start)
         delays = magnetic.onto_gyro_clock(setup)
         clocks = {name: Clock(rig.sensors[name].clock_offset) for name in samples if is_position(rig, name)}
         problem = search.find(setup, clocks, tell)

@@ -8,11 +8,12 @@ import numpy as np
 
 from tbmfg import measure
 from tbmfg.errors import EstimationError
+from tbmfg.fields import MICRO_TESLA
 from tbmfg.measure import Clock
 from tbmfg.prepare.samples import ALONE, is_position
 from tbmfg.prepare.scans import lidar_rows
 from tbmfg.prepare.start import Setup
-from tbmfg.problem import CLOCK, Inertial, Parameters, Prior, Problem
+from tbmfg.problem import CLOCK, STRENGTH, Inertial, Parameters, Prior, Problem
 from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, kind_of
 from tbmfg.state import BG, NAV, ROT
 from tbmfg.timeseries import Floats
@@ -53,7 +54,8 @@ def build(setup: Setup, clocks: dict[str, Clock], factors: Floats, end_s: float 
             rows.append(measure.odometer_rows(sensor, s, keyframes, setup.frame, calib))
         elif isinstance(sensor, Magnetometer):
             azimuth = rig.origin.x_axis_azimuth
-            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, setup.R_start, azimuth, calib))
+            horizontal = MICRO_TESLA * parameters.prior(f"{name}.{STRENGTH}")
+            rows.append(measure.magnetometer_rows(sensor, s, keyframes, setup.frame, azimuth, calib, horizontal))
         elif isinstance(sensor, Lidar):
             rows.append(lidar_rows(sensor, s, keyframes, setup, calib))
         elif isinstance(sensor, Laser):

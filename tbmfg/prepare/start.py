@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tbmfg import earth
+from tbmfg.fields import MICRO_TESLA
 from tbmfg.geometry import rotation_from_rpy, rotation_z, wrap, yaw_of
 from tbmfg.inertial import alignment
 from tbmfg.inertial.steps import Steps, compensate
 from tbmfg.lidar.clouds import Scans
-from tbmfg.measure import GyroFrame, Samples, gyro_frame
+from tbmfg.measure import GyroFrame, Samples, gyro_frame, horizontal_field
 from tbmfg.prepare import rest
 from tbmfg.prepare.rest import Rest
 from tbmfg.prepare.samples import is_position
-from tbmfg.problem import Parameters
+from tbmfg.problem import STRENGTH, Parameters
 from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, Rig
 from tbmfg.state import Calibrated, Counts, Interval
 from tbmfg.timeseries import Floats
@@ -100,8 +101,8 @@ def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str,
     standing = rest.find(rig, samples, steps, still) if rig.zero_velocity.enabled else rest.NONE
     origin_n = np.round(np.median(position.values[:50], axis=0)) if position is not None else np.zeros(3)
     return Setup(
-        rig, steps, frame, gyro, acc, samples, parameters_of(rig, samples), R_start, yaw_sd, gyrocompassed, standing,
-        bias_gyro, origin_n, counts, warnings,
+        rig, steps, frame, gyro, acc, samples, parameters_of(rig, samples, frame, R_start), R_start, yaw_sd,
+        gyrocompassed, standing, bias_gyro, origin_n, counts, warnings,
     )  # fmt: skip
 
 
@@ -177,8 +178,9 @@ def _course_heading(
     return alignment.turn_between(S - S.mean(axis=0), z - z.mean(axis=0), COURSE_SD)
 
 
-def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
-    """The constant calibrations of the sensors at hand, with the rig's priors."""
+def parameters_of(rig: Rig, samples: dict[str, Samples], frame: GyroFrame, R_start: Floats) -> Parameters:
+    """The constant calibrations of the sensors at hand, with the rig's priors; of the Earth's horizontal field, that a
+    machine's own is told by, with what the log begins with, at ``R_start`` (3, 3)."""
     entries: list[tuple[str, float, float]] = []
     for name in samples:
         sensor = rig.sensors[name]
@@ -192,6 +194,9 @@ def parameters_of(rig: Rig, samples: dict[str, Samples]) -> Parameters:
         elif isinstance(sensor, Magnetometer):
             entries += [(f"{name}.declination", sensor.declination, sensor.declination_sd)]
             entries += [(f"{name}.iron_{axis}", 0.0, sensor.hard_iron_sd_ut) for axis in "xyz"]
+            if sensor.hard_iron_sd_ut:
+                found = horizontal_field(sensor, samples[name], frame, R_start, rig.initial.tilt_sd)
+                entries += [(f"{name}.{STRENGTH}", found[0] / MICRO_TESLA, found[1] / MICRO_TESLA)]
         elif isinstance(sensor, Lidar):
             entries += [(f"{name}.mount_{axis}", sensor.T_bl.xyz[k], sensor.xyz_sd) for k, axis in enumerate("xyz")]
             entries += [(f"{name}.turn_{axis}", 0.0, sensor.rpy_sd) for axis in "xyz"]
