@@ -92,6 +92,7 @@ ADVICE = {
     "at rest; {went}",
     "iron": "the machine's own field turns with it, the Earth's does not: turn it about all axes, full circles first; "
     "{turns}",
+    "strength": "turning tells the Earth's field from the machine's own: about all axes, full circles first; {turns}",
     "mount": "the LiDAR's place shows where the machine turns, about two axes at least; {turns}",
     "turn": "the LiDAR's axes show in turns about two axes at least, one leaves the angle about itself open; {turns}",
     "tilt": "the line's tilt shows in how the spot moves over a long way along the line while the position is known "
