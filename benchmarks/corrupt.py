@@ -123,7 +123,7 @@ def unsound(folder: Path) -> str | None:
             for name, values in arrays.items():
                 if values.dtype.kind == "f" and not np.isfinite(values).all():
                     return f"{path.name}: {name}"
-            if (np.diagonal(arrays["cov"], axis1=1, axis2=2) < 0).any():
+            if "cov" in arrays and (np.diagonal(arrays["cov"], axis1=1, axis2=2) < 0).any():
                 return f"{path.name}: a variance below zero"
     for path in sorted(folder.glob("*.tum")):
         if not np.isfinite(np.loadtxt(path)).all():

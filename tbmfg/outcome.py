@@ -84,6 +84,7 @@ def result(
         calibration={**calibrations(problem, c, sd), **_drifts(problem, x, cov)},
         counts=_counts(problem, gated),
         innovations=innovations,
+        health=problem.health,
         intervals=[*problem.intervals, *stretches, *(one.stretch for one in biased)],
         warnings=[
             *diagnosis.unobserved(problem, path, sd),
@@ -111,6 +112,7 @@ def of_samples(problem: Problem, estimator: str, x: Floats, cov: Floats | None, 
         calibration=dict(problem.calibration),
         counts=_completed(counts),
         intervals=list(problem.intervals),
+        health=problem.health,
         warnings=said,
     )
 

@@ -14,7 +14,7 @@ from tbmfg.lidar.clouds import Scans
 from tbmfg.measure import Clock, Samples
 from tbmfg.rig import Rig
 from tbmfg.sensors import Rows
-from tbmfg.state import NAV, Calibrated, Counts, Interval
+from tbmfg.state import NAV, Calibrated, Counts, Health, Interval
 from tbmfg.timeseries import Floats, Times
 
 CLOCK = ("clock_offset", "clock_drift")  # parameters that say when a row was measured
@@ -101,8 +101,8 @@ class Problem:
     ``keyframe_edges`` (n,) are the IMU edges at which the keyframes lie.
     ``drift_walk`` (e,) are the random walks of the drifting calibrations ``drift_names``;
     ``clocks`` those that the rows were placed with; ``samples`` what the rows were made of, by sensor,
-    for filters that take every sample when it comes. ``scans`` are those of every LiDAR, still in the log; ``measured``
-    the IMU's steps before any enhancement.
+    for filters that take every sample when it comes. ``scans`` are those of every LiDAR, still in the log, and
+    ``health`` how they fit; ``measured`` the IMU's steps before any enhancement.
     """
 
     rig: Rig
@@ -121,6 +121,7 @@ class Problem:
     intervals: list[Interval] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     scans: dict[str, Scans] = field(default_factory=dict)
+    health: dict[str, Health] = field(default_factory=dict)
     measured: Steps | None = None
 
     @property

@@ -27,7 +27,17 @@ NIS_BINS = 60  # stretches of time that a summary gives the innovations in
 SUMMARY = "summary.json"
 REPORT = "report.html"
 # The summary is first to go and last to come: a folder that holds one holds a complete result.
-FILES = ("trajectory.tum", "result.npz", "smoothed.tum", "smoothed.npz", "result.mcap", "rig.yaml", REPORT, SUMMARY)
+FILES = (
+    "trajectory.tum",
+    "result.npz",
+    "smoothed.tum",
+    "smoothed.npz",
+    "health.npz",
+    "result.mcap",
+    "rig.yaml",
+    REPORT,
+    SUMMARY,
+)
 
 
 # ---- a result folder ----
@@ -79,6 +89,13 @@ def write_result(
         _write_trajectory_files(folder, "trajectory.tum", "result.npz", result.trajectory)
         if result.smoothed is not None:
             _write_trajectory_files(folder, "smoothed.tum", "smoothed.npz", result.smoothed)
+        if result.health:
+            told = {
+                f"{lidar}_{part}": values
+                for lidar, one in result.health.items()
+                for part, values in asdict(one).items()
+            }
+            np.savez(folder / "health.npz", **told)
         write_trajectory(
             folder / "result.mcap",
             result.trajectory,

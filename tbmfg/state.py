@@ -102,12 +102,30 @@ class Interval:
     end_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class Health:
+    """How one LiDAR's scans, taken at ``t_ns`` (n,), fit the map that they make.
+
+    ``overlap``: share of the points near planes of the map that lie on them; ``residual_m``: noise of their distances;
+    ``weak``: how many directions the walls do not tell, of six; ``dust``: share of the nearer points that hang in the
+    air; ``healthy``: whether the scan fits as scans usually do. (n,) each.
+    """
+
+    t_ns: Times
+    overlap: Floats
+    residual_m: Floats
+    weak: np.ndarray
+    dust: Floats
+    healthy: np.ndarray
+
+
 @dataclass(slots=True)
 class Result:
     """What every estimator returns.
 
     ``trajectory`` is the plain (for online solvers: causal) one; ``smoothed`` the last estimates,
-    where they differ. ``summary`` is the content of summary.json, once there is one.
+    where they differ. ``health`` is that of every LiDAR's scans,
+    alike for all estimators. ``summary`` is the content of summary.json, once there is one.
     """
 
     estimator: str
@@ -118,4 +136,5 @@ class Result:
     innovations: dict[str, Innovations] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    health: dict[str, Health] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)

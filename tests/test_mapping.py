@@ -21,10 +21,10 @@ from tbmfg.geometry import exp_so3, rpy_from_rotation
 from tbmfg.lidar import raster
 from tbmfg.lidar.air import Air
 from tbmfg.mcap import read_log
-from tbmfg.pipeline import run
+from tbmfg.pipeline import run, run_result
 from tbmfg.results import read_calibration, summarise, write_result
 from tbmfg.rig import dump_rig, load_rig, override
-from tbmfg.state import Calibrated, Result, Trajectory
+from tbmfg.state import Calibrated, Health, Result, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,25 @@ def test_a_result_carries_the_map(made, tmp_path):
     assert len(cubes) > 0.99 * len(points)  # one point in each, but for those that float32 rounds into the next
     page = (tmp_path / "ins" / "report.html").read_text("utf-8")
     assert "the map along ins, of " in page
+    assert "How the scans fit" in page
     assert len(page) < 15e6
+
+
+def test_a_result_says_how_every_scan_fits(made, tmp_path):
+    log, _ = made
+    result, _ = run_result(str(log), estimator="ins", output=tmp_path / "ins")
+    with np.load(tmp_path / "ins" / "health.npz") as arrays:
+        told = {name.removeprefix("lidar_"): arrays[name] for name in arrays}
+    assert told.keys() == set(Health.__slots__)
+    stamps = read_log(log).clouds["/points"].t_ns
+    assert len(told["t_ns"]) == len(stamps) - 1  # the first begins before the IMU
+    assert (np.diff(told["t_ns"]) > 0).all()
+    assert told["t_ns"][0] - stamps[1] == pytest.approx(1e8, abs=1e6)  # the end of a scan
+    assert told["healthy"].all()
+    assert told["overlap"][5:].min() > 0.5
+    assert 0.0 < np.median(told["residual_m"]) < 0.06
+    assert told["dust"].max() < 0.4
+    assert np.array_equal(result.health["lidar"].weak, told["weak"])
 
 
 def test_ghosts_show(made, tmp_path):

@@ -27,7 +27,7 @@ from tbmfg.results import (
     write_result,
     write_tum,
 )
-from tbmfg.state import Calibrated, Counts, Innovations, Interval, Result, Trajectory
+from tbmfg.state import Calibrated, Counts, Health, Innovations, Interval, Result, Trajectory
 from tbmfg.timeseries import Log, Series
 
 EPOCH_NS = 1_403_636_579_763_555_584
@@ -111,7 +111,9 @@ def test_npz_round_trip(tmp_path):
 
 
 def test_every_file_is_written(tmp_path):
-    write_result(tmp_path / "new" / "out", result(smoothed=True), {"a": 1}, "name: rig\n", report="<p>")
+    scanned = result(smoothed=True)
+    scanned.health = {"lidar": Health(scanned.trajectory.t_ns, *np.zeros((5, len(scanned.trajectory))))}
+    write_result(tmp_path / "new" / "out", scanned, {"a": 1}, "name: rig\n", report="<p>")
     assert names_in(tmp_path / "new" / "out") == sorted(FILES)
     assert json.loads((tmp_path / "new" / "out" / "summary.json").read_text()) == {"a": 1}
 

@@ -64,7 +64,7 @@ def prepare(
         clocks = {name: Clock(rig.sensors[name].clock_offset) for name in samples if is_position(rig, name)}
         problem = search.find(setup, clocks, tell)
         problem.calibration |= told | delays | setup.calibration
-        problem.measured, problem.scans = measured, setup.scans
+        problem.measured, problem.scans, problem.health = measured, setup.scans, setup.health
     problem.intervals = [
         *setup.intervals,
         *silent,

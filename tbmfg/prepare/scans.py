@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tbmfg.inertial.steps import to_ns
+from tbmfg.inertial.steps import Steps, to_ns
 from tbmfg.lidar import clouds
 from tbmfg.lidar.motion import Inertia
 from tbmfg.lidar.odometry import Odometry, Pose
@@ -18,7 +18,7 @@ from tbmfg.prepare.samples import hidden
 from tbmfg.prepare.start import Setup
 from tbmfg.rig import Lidar, Odometer, Rig, kind_of
 from tbmfg.sensors import Rows
-from tbmfg.state import Interval
+from tbmfg.state import Health, Interval
 from tbmfg.timeseries import Floats, Log, seconds
 
 CARRIED_S = 0.5  # longest time that the IMU carries a keyframe to a scan
@@ -66,6 +66,8 @@ def register(
     setup.intervals += [
         Interval(name, "lost", *(int(t) for t in to_ns(steps, np.array(ends)))) for ends in _astray(poses)
     ]
+    if poses:
+        setup.health[name] = _health(poses, steps)
     placed = [pose for pose in poses if pose.placed]
     if len(placed) < 2:
         setup.warnings.append(f"{name}: {len(placed)} of {len(source)} scans can be registered; it is not used")
@@ -110,6 +112,13 @@ def _of_poses(poses: list[Pose], odometry: Odometry) -> list[str]:
     if dusty > WORTH_SAYING * count:
         lines.append(f"dust: in {dusty} of {count} scans over {DUSTY:.0%} of the nearer points hang in the air")
     return lines
+
+
+def _health(poses: list[Pose], steps: Steps) -> Health:
+    """What the registration tells of every scan."""
+    parts = ("t_s", "overlap", "sigma", "weak", "dust", "healthy")
+    t_s, *told = (np.array([getattr(pose, part) for pose in poses]) for part in parts)
+    return Health(to_ns(steps, t_s), *told)
 
 
 def _astray(poses: list[Pose]) -> list[tuple[float, float]]:

@@ -18,7 +18,7 @@ from tbmfg.prepare.rest import Rest
 from tbmfg.prepare.samples import is_position
 from tbmfg.problem import STRENGTH, Parameters
 from tbmfg.rig import Barometer, Laser, Lidar, Magnetometer, Odometer, PositionSensor, Rig
-from tbmfg.state import Calibrated, Counts, Interval
+from tbmfg.state import Calibrated, Counts, Health, Interval
 from tbmfg.timeseries import Floats
 
 COURSE_S = 120.0  # of driving that a heading is taken from
@@ -49,6 +49,7 @@ class Setup:
     calibration: dict[str, Calibrated] = field(default_factory=dict)
     intervals: list[Interval] = field(default_factory=list)
     scans: dict[str, Scans] = field(default_factory=dict)
+    health: dict[str, Health] = field(default_factory=dict)
 
 
 def align(rig: Rig, steps: Steps, samples: dict[str, Samples], counts: dict[str, Counts], warnings: list[str]) -> Setup:

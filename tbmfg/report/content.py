@@ -11,7 +11,7 @@ import numpy as np
 from tbmfg.evaluation.metrics import Errors, at_point, trajectory_errors
 from tbmfg.geometry import matrix_from_quat
 from tbmfg.rig import Rig
-from tbmfg.state import POS, ROT, Innovations, Result, Trajectory, Truth
+from tbmfg.state import POS, ROT, Health, Innovations, Result, Trajectory, Truth
 from tbmfg.timeseries import Floats, Log, Times
 
 POSE = slice(0, 6)  # of the covariance, what is drawn: rotation in b and position in n
@@ -61,6 +61,7 @@ class Report:
     summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
     tracks: list[Track] = field(default_factory=list)
     innovations: dict[str, dict[str, Innovations]] = field(default_factory=dict)
+    health: Mapping[str, Health] = field(default_factory=dict)
     truth: Truth | None = None
 
     def add(self, result: Result, summary: dict[str, Any], truth: Truth | None) -> None:
@@ -73,6 +74,7 @@ class Report:
             self.tracks.append(_track(f"{name} (causal)", name, False, result.trajectory, truth))
             self.tracks.append(_track(f"{name} (last)", name, True, result.smoothed, truth))
         self.innovations[name] = result.innovations
+        self.health = result.health
         self.truth = self.truth or truth
 
     def span_s(self) -> tuple[float, float]:

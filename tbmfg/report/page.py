@@ -120,6 +120,7 @@ def figures(report: Report, pen: dict[str, Pen]) -> list[Figure]:
         accuracy.errors,
         accuracy.how_sure,
         accuracy.innovations,
+        timeline.health,
         timeline.availability,
         timeline.deviation,
         paths.states,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tbmfg.report.content import Report
-from tbmfg.report.panels import GRID, TIME, Figure, Pen, axis, labelled, layout
+from tbmfg.report.panels import COLOURS, GRID, TIME, Figure, Pen, add_line, axis, labelled, layout, stacked
 from tbmfg.report.tables import deviations, titled, worded
 from tbmfg.report.thin import packed, segments
 from tbmfg.timeseries import Floats
@@ -48,6 +48,26 @@ def availability(report: Report, pen: dict[str, Pen]) -> Figure:
         figure.data.append(_bars(escape(kind), KINDS.get(kind, OTHER_KIND), 7, bars, True))
     figure.layout = _rows(rows)
     figure.layout["xaxis"]["range"] = [begin, max(end, begin + 1.0)]  # of all stamps: a clock may be far off
+    return figure
+
+
+def health(report: Report, pen: dict[str, Pen]) -> Figure | None:
+    """How every LiDAR's scans fit the map that they make."""
+    if not report.health:
+        return None
+    figure = Figure(
+        "How the scans fit",
+        "Of every scan: the share of its points near surfaces of the map that lie on them, the noise of these, how "
+        "many of six directions the walls do not tell, and the share of its nearer points that hang in the air, as "
+        "dust does.",
+    )
+    titles = ["overlap, %", "residual, mm", "directions untold", "dust, %"]
+    figure.layout = stacked(titles, TIME, 90, rangemode="tozero")
+    for number, (lidar, told) in enumerate(report.health.items()):
+        own, t_s = Pen(escape(lidar), escape(lidar), COLOURS[number % len(COLOURS)], "solid"), told.t_ns - report.t0_ns
+        values = (100.0 * told.overlap, 1e3 * told.residual_m, told.weak.astype(float), 100.0 * told.dust)
+        for panel, y in enumerate(values):
+            add_line(figure, own, t_s * 1e-9, y, panel, shown=panel == 0)
     return figure
 
 
