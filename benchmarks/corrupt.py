@@ -29,7 +29,12 @@ from tbmfg.errors import TbmfgError
 DATASETS = ("tbm-drive", "shearer-cut", "shaft-descend")
 OUTCOMES = ("ended", "refused", "crashed", "hung", "unsound")
 COUNTED = {"bursts", "length", "reach"}  # parameters of faults that are numbers of messages
-UNASKED = ("outage_position_rms_m", ".observed")  # null without an outage, of what is not estimated
+UNASKED = (
+    "outage_position_rms_m",
+    ".observed",
+    ".correlation",
+    ".correlation_sd",
+)  # null without an outage, of what is not estimated
 LIMIT_S = 120.0  # of computing, for a log of seconds
 
 

@@ -77,6 +77,9 @@ def result(
         rows.sensor: Innovations(row_times_ns[rows.j], nis[rows.sensor], rows.dof, gated[rows.sensor])
         for rows in problem.rows
     }
+    told = residuals.correlation(problem, at, c, gated) if last_x is not None else {}
+    for sensor, one in told.items():
+        innovations[sensor] = replace(innovations[sensor], correlation=one.value, correlation_sd=one.sd)
     stretches = diagnosis.gated_stretches(innovations)
     return Result(
         estimator=estimator,
@@ -92,6 +95,7 @@ def result(
             *diagnosis.gated_in_words(innovations, stretches, problem.t0_ns),
             *diagnosis.gated_together(stretches, problem.t0_ns),
             *residuals.biased_in_words(biased, problem.t0_ns),
+            *residuals.correlated_in_words(problem, told),
         ],
     )
 

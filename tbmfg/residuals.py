@@ -18,6 +18,9 @@ from tbmfg.timeseries import Floats
 
 BIASED = 3.0  # sds to one side from which a sensor of one number is called biased
 MEDIAN_ROWS = 9  # of the running median that judges it
+FEWEST_PAIRS = 30  # of neighbours that a correlation is taken of
+CHANCE = 1e-3  # with which white residuals of one of the sensors would be named
+WORTH = 1.2  # factor on sds from which a correlation is worth naming
 UNTOLD = 1e3  # m and rad: sd of what the walls tell a LiDAR nothing of
 
 # By model: what a positive residual means for the reading, the words for each component, and the unit with its size in
@@ -92,6 +95,60 @@ def biased(problem: Problem, x: Floats, c: Floats, causal: bool = False) -> list
                     stretch = Interval(rows.sensor, "biased", int(t_ns[first]), int(t_ns[last]))
                     found.append(Bias(stretch, where, float(np.median(size[first : last + 1])), unit))
     return sorted(found, key=lambda one: one.stretch.start_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """How much of a residual the next one repeats: lag-1 correlation ``value`` over all components, rows that are
+    gated left out; ``sd``, by how much it is off zero if they are white, 1 / sqrt(n), Bartlett (1946); ``square``: the
+    mean square of the residuals in sds of the rig."""
+
+    value: float
+    sd: float
+    square: float
+
+    @property
+    def factor(self) -> float:
+        """By how much the sd of a mean of many is larger than if they were white and as large as the rig says: of a
+        Markov process sqrt(square (1 + value) / (1 - value)). Readings that share a sample, as an odometer's do, repeat
+        a part too, but are so much smaller than their share that it comes out as 1."""
+        return float(np.sqrt(self.square * (1.0 + self.value) / max(1.0 - self.value, 1e-3)))
+
+
+def correlation(problem: Problem, x: Floats, c: Floats, gated: dict[str, np.ndarray]) -> dict[str, Correlation]:
+    """By sensor, at smoothed states ``x`` and calibrations ``c``. What a fit takes from white noise makes neighbours
+    differ, never agree: a correlation above zero is the sensor's."""
+    found = {}
+    for rows in problem.rows:
+        if rows.model not in AXES:
+            continue
+        r, own = parted(problem, rows, x, c)[0], ~gated[rows.sensor]
+        if rows.model == "odometer":
+            r = r[:, :1]  # that it does not slide is no reading of it
+        pairs = own[:-1] & own[1:]
+        before, after = r[:-1][pairs], r[1:][pairs]
+        size = float(np.sqrt(np.sum(before**2) * np.sum(after**2)))
+        if before.size >= FEWEST_PAIRS and size > 0:
+            found[rows.sensor] = Correlation(
+                float(np.sum(before * after)) / size, before.size**-0.5, float(np.mean(r[own] ** 2))
+            )
+    return found
+
+
+def correlated_in_words(problem: Problem, found: dict[str, Correlation]) -> list[str]:
+    """Sensors whose residuals tell of the next more than chance explains, and enough to matter."""
+    lines = []
+    for sensor, one in found.items():
+        limit = -float(ndtri(CHANCE / len(found))) * one.sd
+        if one.value > limit and one.factor > WORTH:
+            times = problem.rig.sensors[sensor].times * one.factor
+            lines.append(
+                f"{sensor}: its residuals are no white noise, {one.value:.0%} of one is in the next (by chance "
+                f"{limit:.0%} at most): sds that rest on it are too small, by a factor of about {one.factor:.1f}; look "
+                "for what drifts (clock, mounting, smoothing in the device), or set "
+                f"sensors.{sensor}.noise_factor={times:.2g}"
+            )
+    return lines
 
 
 def biased_in_words(found: list[Bias], origin_ns: int) -> list[str]:

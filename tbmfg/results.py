@@ -178,6 +178,8 @@ def _innovation_summary(innovations: Innovations, t0_ns: int) -> dict[str, Any]:
         "gated": int(gated.sum()),
         "dof": innovations.dof,
         "nis_per_dof": float(accepted.mean()) / innovations.dof if len(accepted) else None,
+        "correlation": innovations.correlation,
+        "correlation_sd": innovations.correlation_sd,
         "over_time": _over_time(innovations, t0_ns),
     }
 

@@ -83,12 +83,15 @@ class Calibrated:
 
 @dataclass(frozen=True, slots=True)
 class Innovations:
-    """Squared normalised residuals of one sensor at its keyframes: ``nis`` (m,), ``dof``, ``gated`` (m,)."""
+    """Squared normalised residuals of one sensor at its keyframes: ``nis`` (m,), ``dof``, ``gated`` (m,); their
+    ``correlation`` from one to the next and by how much (1 sd) it is off zero by chance, None where it is not asked."""
 
     t_ns: Times
     nis: Floats
     dof: int
     gated: np.ndarray
+    correlation: float | None = None
+    correlation_sd: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

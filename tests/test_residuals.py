@@ -8,7 +8,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+import datasets
 from tbmfg import residuals
 from tbmfg.estimators import estimate
 from tbmfg.prepare import prepare
@@ -66,6 +68,42 @@ def test_wheels_that_spin_are_told_as_a_speed(problem):
     [line], [(start, end)] = told(with_z(problem, "odometer", spun), "odometer")
     assert line.startswith("odometer: biased by +0.3 m/s ahead from ")
     assert (start, end) == (pytest.approx(10.0, abs=1.0), pytest.approx(20.0, abs=1.0))
+
+
+def test_noise_that_drifts_is_no_white_noise(problem):
+    """Half as large again as the rig says, 0.9 of it in the next: its mean over long is off by sqrt(19) times more."""
+    rng = np.random.default_rng(1)
+
+    def drifting(rows):
+        white = 1.5 * np.sqrt(1 - 0.9**2) * rng.standard_normal(rows.z.shape)
+        return rows.sigma * lfilter([1.0], [1.0, -0.9], white, axis=0)
+
+    result = estimate("batch", with_z(problem, "prism", drifting))
+    [line] = [line for line in result.warnings if "no white noise" in line]
+    assert line.startswith("prism: its residuals")
+    series = result.innovations["prism"]
+    assert series.correlation > 5 * series.correlation_sd
+    said = float(re.search(r"by a factor of about (\S+);", line)[1])
+    assert 1.5 < said < np.sqrt(19 * 1.5**2 + 1), "the fit takes the slowest part of it"
+    assert re.search(r"sensors\.prism\.noise_factor=(\S+)", line)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "options"),
+    [("tbm-drive", {"vibration": 0.0, "slide": 1.0}), ("shearer-cut", {}), ("shaft-descend", {})],
+)
+def test_noise_of_nominal_machines_is_white(dataset, options):
+    known = ("sensors.imu.noise_factor=1",)
+    simulation = datasets.make(dataset, seed=5, duration=40.0, settings=known, **options)
+    result = estimate("batch", prepare(problems.log_of(simulation.log_series), simulation.rig))
+    assert not any("no white noise" in line or "biased by" in line for line in result.warnings)
+    assert all(
+        series.correlation is not None for name, series in result.innovations.items() if name in simulation.rig.sensors
+    )
+
+
+def test_what_smoothing_has_not_seen_is_not_asked(problem):
+    assert estimate("ins", problem).innovations["prism"].correlation is None
 
 
 @pytest.mark.parametrize("components", [2, 3, 6])

@@ -227,7 +227,9 @@ def test_summary_of_a_result():
     }
     assert summary["sensors"]["prism"]["gated"] == 1
     over_time = summary["innovations"]["prism"].pop("over_time")
-    assert summary["innovations"]["prism"] == {"updates": 3, "gated": 1, "dof": 3, "nis_per_dof": 1.5}
+    assert summary["innovations"]["prism"] == {
+        "updates": 3, "gated": 1, "dof": 3, "nis_per_dof": 1.5, "correlation": None, "correlation_sd": None,
+    }  # fmt: skip
     assert over_time["nis_per_dof"] == [1.0, 2.0, 30.0]
     assert over_time["gated"] == [0.0, 0.0, 1.0]
     assert summary["innovations"]["laser"]["nis_per_dof"] is None
