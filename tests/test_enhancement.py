@@ -207,6 +207,21 @@ def test_white_noise_and_walk_are_found():
     assert both.walk == pytest.approx(K, rel=4 / np.sqrt(2 * 3 * 36))
 
 
+def test_the_sds_of_density_and_walk_hold():
+    N, K, dt, z = 0.01, 2e-4, 0.05, []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        white = N / np.sqrt(dt) * rng.standard_normal((36_000, 3))
+        found = allan.noise(white + np.cumsum(K * np.sqrt(dt) * rng.standard_normal((36_000, 3)), axis=0), dt)
+        if found.walk is not None:
+            errors = found.density / N - 1.0, found.walk / K - 1.0
+            z.append(np.array(errors) / np.array(found.relative_sd)[[0, 2]])
+    assert len(z) > 50
+    # sixty draws tell their spread to 9 %, and the kernel of what averages share is good to a third
+    spread = np.sqrt(np.mean(np.square(z), axis=0))
+    assert np.all((spread > 0.6) & (spread < 1.4)), spread
+
+
 def test_info_prints_the_noise_of_the_standing_machine(tmp_path):
     simulation = datasets.make("tbm-static", seed=0, duration=40.0, imu_rate_hz=100.0)
     log = tmp_path / "static.mcap"
@@ -214,8 +229,9 @@ def test_info_prints_the_noise_of_the_standing_machine(tmp_path):
     said = CliRunner().invoke(app, ["info", str(log), "--allan"])
     assert said.exit_code == 0
     [line] = [line for line in said.output.splitlines() if line.startswith("acc_density_ug_rthz")]
-    found, rig = map(float, line.split()[1:])
-    assert found == pytest.approx(10.0, rel=0.05)
+    found, sd, rig = map(float, line.split()[1:])
+    assert 0 < sd < 0.1
+    assert found == pytest.approx(10.0, abs=5 * sd)
     assert rig == 10.0
 
 

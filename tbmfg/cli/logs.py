@@ -127,14 +127,14 @@ def _allan(log: str, rig: str | None) -> dict[str, Any]:
     from tbmfg.inertial.allan import against_rig
 
     found, imu = pipeline.allan(log, rig)
-    noise = {name: {"found": value, "rig": said} for name, value, said in against_rig(found, imu)}
+    noise = {name: {"found": value, "sd": sd, "rig": said} for name, value, sd, said in against_rig(found, imu)}
     return {"start_s": found.start_s, "end_s": found.end_s, "noise": noise}
 
 
 def _print_allan(out: Terminal, allan: dict[str, Any]) -> None:
     out.say(f"\nAllan variance, standing from {allan['start_s']:.1f} to {allan['end_s']:.1f} s")
     rows = [
-        (name, "not seen" if one["found"] is None else number(one["found"]), number(one["rig"]))
+        (name, "not seen" if one["found"] is None else number(one["found"]), number(one["sd"]), number(one["rig"]))
         for name, one in allan["noise"].items()
     ]
-    out.table(["", "found", "rig"], rows, justify="right")
+    out.table(["", "found", "sd", "rig"], rows, justify="right")

@@ -31,6 +31,7 @@ class Noise:
     density: float | None
     instability: float | None
     walk: float | None
+    relative_sd: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the three, as a share of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +57,23 @@ def static(steps: Steps) -> Static:
     return Static(*longest, noise(steps.gyro[rows], steps.period_s), noise(steps.acc[rows], steps.period_s))
 
 
-def against_rig(found: Static, imu: Imu) -> list[tuple[str, float | None, float | None]]:
-    """(key of the rig, what was found, what the rig has) in the rig's units; bias instability has no key."""
+def against_rig(found: Static, imu: Imu) -> list[tuple[str, float | None, float | None, float | None]]:
+    """(key of the rig, what was found, its sd, what the rig has) in the rig's units; bias instability has no key."""
     gyro, acc = found.gyro, found.acc
     return [
-        ("gyro_density_dps_rthz", _in(gyro.density, DEG), imu.gyro_density_dps_rthz),
-        ("gyro bias instability, deg/s", _in(gyro.instability, DEG), None),
-        ("gyro_walk", gyro.walk, imu.gyro_walk),
-        ("acc_density_ug_rthz", _in(acc.density, MICRO_G), imu.acc_density_ug_rthz),
-        ("acc bias instability, m/s^2", acc.instability, None),
-        ("acc_walk", acc.walk, imu.acc_walk),
+        ("gyro_density_dps_rthz", *_in(gyro, 0, DEG), imu.gyro_density_dps_rthz),
+        ("gyro bias instability, deg/s", *_in(gyro, 1, DEG), None),
+        ("gyro_walk", *_in(gyro, 2), imu.gyro_walk),
+        ("acc_density_ug_rthz", *_in(acc, 0, MICRO_G), imu.acc_density_ug_rthz),
+        ("acc bias instability, m/s^2", *_in(acc, 1), None),
+        ("acc_walk", *_in(acc, 2), imu.acc_walk),
     ]
 
 
-def _in(value: float | None, unit: float) -> float | None:
-    return None if value is None else value / unit
+def _in(noise: Noise, which: int, unit: float = 1.0) -> tuple[float | None, float | None]:
+    """One of the figures of a triad and its sd."""
+    value = (noise.density, noise.instability, noise.walk)[which]
+    return (None, None) if value is None else (value / unit, value / unit * noise.relative_sd[which])
 
 
 def variance(samples: Floats, period_s: float) -> tuple[Floats, Floats]:
@@ -89,7 +92,9 @@ def variance(samples: Floats, period_s: float) -> tuple[Floats, Floats]:
 def noise(samples: Floats, period_s: float) -> Noise:
     """Fit of N^2/tau + 2 ln 2/pi B^2 + K^2 tau/3, and of Q^2/tau^2, which takes up vibration and rounding.
 
-    Non-negative least squares on the relative error; the longer the averaging time, the fewer averages there are.
+    Non-negative least squares on the relative error; the longer the averaging time, the fewer averages there are. The
+    sds are those of the fit from Allan deviations known to 1 / sqrt(2 (n / m - 1)) of themselves, by n samples on each
+    axis in averages of m (IEEE Std 952-1997, C.1.7), of which those less than two octaves apart go together.
     """
     tau, found = variance(samples, period_s)
     terms = np.stack([1.0 / tau, np.full(len(tau), 2.0 * np.log(2.0) / np.pi), tau / 3.0, 1.0 / tau**2], axis=1)
@@ -99,4 +104,12 @@ def noise(samples: Floats, period_s: float) -> Noise:
     parts = share / scale * terms
     seen = (parts > SEEN * parts.sum(axis=1, keepdims=True)).any(axis=0)
     sizes = np.sqrt(share / scale)
-    return Noise(*(float(size) if shown else None for size, shown in zip(sizes[:3], seen[:3], strict=True)))
+    octaves = np.log2(tau / tau[0])
+    error = found * np.sqrt(2.0 / ((len(samples) * period_s / tau - 1.0) * samples.shape[1]))
+    shared = np.maximum(1.0 - 0.5 * np.abs(octaves[:, None] - octaves), 0.0)
+    active = share > 0
+    gain = np.linalg.pinv((terms / scale * weight[:, None])[:, active]) * (weight * error)
+    relative = np.zeros(len(share))
+    relative[active] = 0.5 * np.sqrt(np.einsum("ki,ij,kj->k", gain, shared, gain)) / share[active]
+    figures = (float(size) if shown else None for size, shown in zip(sizes[:3], seen[:3], strict=True))
+    return Noise(*figures, relative_sd=tuple(relative[:3].tolist()))
