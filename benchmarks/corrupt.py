@@ -26,7 +26,8 @@ import numpy as np
 from benchmarks.rows import Row
 from tbmfg.errors import TbmfgError
 
-DATASETS = ("tbm-drive", "shearer-cut", "shaft-descend")
+DATASETS = ("tbm-drive", "shearer-cut", "shaft-descend", "tbm-roadway")
+SMALL = {"tbm-roadway": {"columns": 60, "lidar_rate_hz": 2.0}}  # scans that take no time
 OUTCOMES = ("ended", "refused", "crashed", "hung", "unsound")
 COUNTED = {"bursts", "length", "reach"}  # parameters of faults that are numbers of messages
 UNASKED = (
@@ -69,10 +70,10 @@ def run(job: Job) -> list[Ended]:
     import datasets
     from datasets import faults
 
-    ended = []
+    ended, options = [], SMALL.get(job.dataset, {}) | job.options
     with tempfile.TemporaryDirectory() as folder:
         clean, log = Path(folder) / "clean.mcap", Path(folder) / "log.mcap"
-        datasets.make(job.dataset, seed=job.seed, duration=job.duration_s, **job.options).write(clean)
+        datasets.make(job.dataset, seed=job.seed, duration=job.duration_s, **options).write(clean)
         wanted = drawn(clean, job.seed, job.duration_s)
         faults.corrupt(clean, log, wanted, seed=job.seed)
         told = " ".join(f"{fault.kind}:{fault.topic}" for fault in wanted)
@@ -88,7 +89,8 @@ def drawn(clean: Path, seed: int, duration_s: float) -> list:
     from tbmfg.mcap import read_log
 
     rng = np.random.default_rng([seed, 1])
-    topics = sorted(topic for topic in read_log(clean).series if "truth" not in topic)
+    log = read_log(clean)
+    topics = sorted(topic for topic in (*log.series, *log.clouds) if "truth" not in topic)
     wanted = []
     for _ in range(rng.integers(1, 5)):
         kind = str(rng.choice(list(faults.KINDS)))
@@ -98,7 +100,8 @@ def drawn(clean: Path, seed: int, duration_s: float) -> list:
             parameters[name] = max(round(parameters[name]), 1)
         if "share" in parameters:
             parameters["share"] = min(parameters["share"], 1.0)
-        wanted.append(faults.Fault(kind, str(rng.choice(topics)), float(start_s), float(end_s), parameters))
+        able = [topic for topic in topics if topic in log.series or kind in faults.STAMPS]
+        wanted.append(faults.Fault(kind, str(rng.choice(able)), float(start_s), float(end_s), parameters))
     return wanted
 
 

@@ -4,34 +4,43 @@
 fault is ``KIND`` or ``KIND:key=value,key=value``: of any kind ``topic`` (the first with positions unless given),
 ``start`` and ``end`` in s from that topic's first stamp, and its own parameters. Sizes are in the units of the message.
 
-Messages that no fault touches are copied byte for byte; of one that is, only the values and the stamp change. The
+Messages that no fault touches are copied byte for byte; of one that is, only the values and the stamp change. Point
+clouds take the kinds that change no values, and stay in the file until they are copied. The
 attachment ``faults.json`` holds what was done: of each fault the kind, topic, parameters, stretch, and the stamps (as
 they were) of the messages that it hit.
 """
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import inspect
+import itertools
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from mcap.reader import McapReader, make_reader
 from mcap.records import Channel, Schema
 from mcap.records import Message as Record
 from numpy.random import Generator
 from numpy.typing import NDArray
 
 from tbmfg.errors import LogError, TbmfgError
+from tbmfg.mcap.clouds import TYPE as CLOUD
 from tbmfg.mcap.into import copying, records
-from tbmfg.mcap.layouts import LAYOUTS, Layout, Rows, decode, patched
+from tbmfg.mcap.layouts import ENCAPSULATION, LAYOUTS, Field, Layout, Rows, decode, patched
 from tbmfg.mcap.reader import recording_files
 from tbmfg.timeseries import NS
 
 TOLD = "faults.json"
+STAMPS = ("gap", "clock", "duplicate", "shuffle")  # kinds that need no more of a message than its stamp
+HEAD = ENCAPSULATION + 8  # bytes up to the end of a header's stamp
+STAMPED = Layout((Field("_sec", "i4", 1), Field("_nsec", "u4", 1)), (), False)
 POSITIONS = ("geometry_msgs/msg/PointStamped", "sensor_msgs/msg/NavSatFix")
 
 
@@ -46,9 +55,20 @@ class Fault:
     parameters: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A cloud that stays in the file ``number``, ``nth`` of its topic at ``log_time``; ``head``, its first bytes, as
+    they are to be."""
+
+    head: bytes
+    number: int
+    log_time: int
+    nth: int
+
+
 @dataclass(slots=True)
 class Messages:
-    """Those of one topic, in the order of their log times."""
+    """Those of one topic, in the order of their log times; the data of clouds are :class:`Stored`."""
 
     number: int
     schema: Schema
@@ -57,17 +77,22 @@ class Messages:
 
     @property
     def layout(self) -> Layout:
-        return LAYOUTS[self.schema.name]
+        return STAMPED if self.schema.name == CLOUD else LAYOUTS[self.schema.name]
 
     def decoded(self) -> Rows:
-        payloads = [bytes(record.data) for record in self.records]
+        stored = self.schema.name == CLOUD
+        payloads = [record.data.head if stored else bytes(record.data) for record in self.records]
         sizes = np.fromiter(map(len, payloads), dtype=np.int64, count=len(payloads))
         return decode(self.layout, np.frombuffer(b"".join(payloads), dtype=np.uint8), sizes)
 
     def patch(self, row: int, values: dict[str, Any], t_ns: int | None = None) -> None:
         """Replace members of one message."""
         record = self.records[row]
-        self.records[row] = replace(record, data=patched(self.layout, record.data, values, t_ns))
+        if isinstance(record.data, Stored):
+            data = replace(record.data, head=patched(self.layout, record.data.head, values, t_ns))
+        else:
+            data = patched(self.layout, record.data, values, t_ns)
+        self.records[row] = replace(record, data=data)
 
 
 # ---- kinds: each changes ``messages`` at some of ``rows`` (k,) and returns which, (m,) ----
@@ -210,6 +235,8 @@ def corrupt(
             raise LogError(
                 f"{source}: no topic {topic or 'with positions'} to make wrong; there are {', '.join(streams)}"
             )
+        if streams[topic].schema.name == CLOUD and fault.kind not in STAMPS:
+            raise LogError(f"{topic}: clouds have no values that {fault.kind} could change; give {', '.join(STAMPS)}")
         touched[topic] = streams[topic]
         told.append({"topic": topic, **_apply(fault, streams[topic], rng)})
     with copying(source, target) as copy:
@@ -220,18 +247,36 @@ def corrupt(
         )
         others = (one for one in records(copy.files) if one[2][1].topic not in touched)
         in_order = sorted(changed, key=lambda one: one[0])
-        for _, number, what in heapq.merge(others, in_order, key=lambda one: one[0]):
-            copy.keep(number, *what)
+        with contextlib.ExitStack() as opened:
+            readers = [make_reader(opened.enter_context(open(path, "rb"))) for path in copy.files]
+            for _, number, (schema, channel, record) in heapq.merge(others, in_order, key=lambda one: one[0]):
+                copy.keep(number, schema, channel, _whole(record, channel.topic, readers))
         copy.attach(TOLD, json.dumps({"seed": seed, "faults": told}).encode())
     return told
+
+
+def _whole(record: Record, topic: str, readers: list[McapReader]) -> Record:
+    """A message with its data, which those of clouds are read for."""
+    stored = record.data
+    if not isinstance(stored, Stored):
+        return record
+    at_once = readers[stored.number].iter_messages([topic], starting_at=stored.log_time, ending_at=stored.log_time)
+    _, _, found = next(itertools.islice(at_once, stored.nth, None))
+    return replace(record, data=stored.head + bytes(found.data[HEAD:]))
 
 
 def _streams(files: list) -> dict[str, Messages]:
     """The topics that can be made wrong, by name."""
     found: dict[str, Messages] = {}
-    for _, number, (schema, channel, record) in records(files):
-        if schema is not None and schema.name in LAYOUTS:
-            found.setdefault(channel.topic, Messages(number, schema, channel, [])).records.append(record)
+    at_once: Counter[tuple[str, int, int]] = Counter()
+    for log_time, number, (schema, channel, record) in records(files):
+        if schema is None or schema.name not in (*LAYOUTS, CLOUD):
+            continue
+        if schema.name == CLOUD:
+            place = channel.topic, number, log_time
+            record = replace(record, data=Stored(bytes(record.data[:HEAD]), number, log_time, at_once[place]))
+            at_once[place] += 1
+        found.setdefault(channel.topic, Messages(number, schema, channel, [])).records.append(record)
     return found
 
 

@@ -9,14 +9,17 @@ from numpy.testing import assert_array_equal
 from scipy.stats import chi2, norm
 
 from benchmarks import corrupt
-from benchmarks.runs import true_states
+from benchmarks.runs import Held, true_states
 from datasets import faults
 from datasets.__main__ import main
+from datasets.simulate import START_NS
 from tbmfg import pipeline
+from tbmfg.errors import LogError
 from tbmfg.evaluation.metrics import trajectory_errors
 from tbmfg.filters.ins import REOPEN
-from tbmfg.mcap import read_log
+from tbmfg.mcap import read_log, write_log
 from tbmfg.state import POS, ROT
+from tbmfg.timeseries import Series, StreamCounts
 from tests.problems import drive
 
 PRISM, IMU, ODOMETER, MAGNETOMETER = "/prism/position", "/imu/data", "/odometer", "/imu/mag"
@@ -96,6 +99,52 @@ def test_each_kind_does_what_it_says(log, tmp_path):
     series, hit, _ = read("shuffle:reach=4")
     assert series.counts.disordered > 0
     assert_array_equal(series["point"], original["point"])
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory):
+    """A log with clouds, some at one log time."""
+    path = tmp_path_factory.mktemp("scanned") / "scanned.mcap"
+    stamps = START_NS + 100_000_000 * np.arange(40)
+    clouds = [(int(t), {"x": np.full(50, float(k), np.float32), "y": np.zeros(50), "z": np.zeros(50)})
+              for k, t in enumerate(stamps)]  # fmt: skip
+    source = Held("/points", stamps, "lidar", StreamCounts(received=40), tuple(clouds))
+    imu = Series("/imu", "sensor_msgs/msg/Imu", stamps, {"gyro": np.zeros((40, 3)), "acc": np.ones((40, 3))})
+    write_log(path, [imu], clouds=[source], log_ns={"/points": np.repeat(stamps[::2], 2)})
+    return path
+
+
+def numbers(path):
+    """Stamps of the clouds in the log, and which they were before."""
+    clouds = read_log(path).clouds["/points"]
+    read = [(t, int(fields["x"][0])) for t, fields in clouds]
+    assert [t for t, _ in read] == clouds.t_ns.tolist()
+    return np.array(read).T, clouds.counts
+
+
+def test_clouds_take_what_needs_no_more_than_stamps(scanned, tmp_path):
+    (stamps, _), _ = numbers(scanned)
+    for spec in ("gap:start=1,end=2", "clock:start=1,end=9,step=0.5", "duplicate:share=0.3", "shuffle:reach=6"):
+        out, told = corrupted(scanned, tmp_path, f"{spec.partition(':')[0]}:topic=/points,{spec.partition(':')[2]}")
+        hit = np.isin(stamps, told["stamps_ns"])
+        (found, which), counts = numbers(out)
+        kind, kept = told["kind"], np.flatnonzero(~hit) if told["kind"] == "gap" else np.arange(40)
+        assert 0 < hit.sum() < 40
+        assert_array_equal(which, kept)
+        assert_array_equal(found, stamps[kept] + (500_000_000 * hit if kind == "clock" else 0))
+        assert counts.duplicate == (hit.sum() if kind == "duplicate" else 0)
+        assert (counts.disordered > 0) == (kind == "shuffle")
+        assert messages(out, "/points")[1] == messages(scanned, "/points")[1]
+
+
+def test_clouds_have_no_values_to_change(scanned, tmp_path):
+    with pytest.raises(LogError, match=r"clouds have no values that bias could change; give gap, clock"):
+        corrupted(scanned, tmp_path, "bias:topic=/points")
+
+
+def test_scans_corrupted_at_random_end_in_a_sound_result_or_in_one_line():
+    [ended] = corrupt.run(corrupt.Job("tbm-roadway", 1, 6.0, ("ins",), {"imu_rate_hz": 100.0}))
+    assert ended.outcome in ("ended", "refused"), ended.said
 
 
 def test_several_faults_on_several_topics(log, tmp_path, capsys):
