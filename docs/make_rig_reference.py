@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from inspect import cleandoc, isclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -35,7 +35,7 @@ def reference() -> str:
 def section(title: str, model: type[BaseModel], skip: tuple[str, ...] = ()) -> str:
     """A heading, what the model says of itself, and a row for each of its keys."""
     rows = [
-        f"| `{name}` | {default(field)} | {cell(field.description or about(field))} |"
+        f"| `{name}` | {default(field)} | {cell((field.description or about(field)) + choices(field))} |"
         for name, field in model.model_fields.items()
         if name not in skip
     ]
@@ -57,6 +57,12 @@ def about(field: FieldInfo) -> str:
     """What the model of a key's value says of itself."""
     model = nested(field)
     return " ".join(cleandoc(model.__doc__ or "").split("\n\n")[0].split()) if model else ""
+
+
+def choices(field: FieldInfo) -> str:
+    """The words that a key may hold, where these are listed."""
+    listed = get_origin(field.annotation) is Literal
+    return f" One of {', '.join(f'`{word}`' for word in get_args(field.annotation))}." if listed else ""
 
 
 def default(field: FieldInfo) -> str:

@@ -16,7 +16,7 @@ from tbmfg.geometry import exp_so3, matrix_from_quat, quat_from_matrix
 from tbmfg.given import truth_for
 from tbmfg.mcap import read_log, write_log
 from tbmfg.prepare import prepare
-from tbmfg.rig import load_rig, parse_rig
+from tbmfg.rig import load_rig, override, parse_rig
 from tbmfg.state import POS, ROT, Calibrated, Trajectory
 from tbmfg.timeseries import NS, Log, Series
 
@@ -212,6 +212,14 @@ def test_a_fix_makes_the_rows_that_a_prism_makes(drives):
     assert_allclose(rows.data, expected.data)
     assert_allclose(rows.sigma, expected.sigma)
     assert [name.replace("gnss", "prism") for name in by_gnss.parameters.names] == list(by_prism.parameters.names)
+
+
+def test_the_noise_of_fixes_is_found(drives):
+    log, _, rig = drives
+    found = prepare(log, override(rig, ["sensors.gnss.noise_factor=auto", "sensors.imu.noise_factor=1"]))
+    factor = found.calibration["gnss_noise_factor"]
+    assert factor.sd < 0.15
+    assert factor.value == pytest.approx(1.0, abs=3.3 * factor.sd)
 
 
 def test_every_fix_is_counted_once(drives):

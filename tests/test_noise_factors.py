@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
+import datasets
 from tbmfg.prepare import prepare
 from tbmfg.rig import override
 from tests.problems import drive, log_of
@@ -34,6 +35,24 @@ def test_half_and_three_times_the_noise_are_found_within_their_sds():
     z = np.array(z)
     assert (np.abs(z) > 2).sum() <= binom.ppf(0.999, len(z), 1 - INSIDE_2SD)
     assert np.sum(z**2) < chi2.ppf(0.999, len(z))
+
+
+def test_barometer_and_laser_of_a_shaft():
+    """A machine that rocks under a plumb line: what hangs and what is pressed, found beside each other."""
+    z = []
+    for seed, (barometer, laser) in enumerate(((3.0, 0.5), (0.5, 3.0), (3.0, 3.0))):
+        true = {"barometer": barometer, "laser": laser}
+        noisy = tuple(f"sensors.{name}.noise_factor={factor}" for name, factor in true.items())
+        known = ("sensors.imu.noise_factor=1", *noisy)
+        simulation = datasets.make("shaft-dynamic", seed=seed, duration=20.0, nominal=1, settings=known)
+        rig = override(simulation.rig, [f"sensors.{name}.noise_factor=auto" for name in true])
+        problem = prepare(log_of(simulation.log_series), rig)
+        for name, factor in true.items():
+            one = problem.calibration[f"{name}_noise_factor"]
+            assert one.sd < 0.2 * factor
+            z.append((one.value - factor) / one.sd)
+    assert np.abs(z).max() < 3.3
+    assert np.sum(np.square(z)) < chi2.ppf(0.999, len(z))
 
 
 def test_the_imu_and_a_prism_beside_each_other():
