@@ -30,12 +30,7 @@ DATASETS = ("tbm-drive", "shearer-cut", "shaft-descend", "tbm-roadway")
 SMALL = {"tbm-roadway": {"columns": 60, "lidar_rate_hz": 2.0}}  # scans that take no time
 OUTCOMES = ("ended", "refused", "crashed", "hung", "unsound")
 COUNTED = {"bursts", "length", "reach"}  # parameters of faults that are numbers of messages
-UNASKED = (
-    "outage_position_rms_m",
-    ".observed",
-    ".correlation",
-    ".correlation_sd",
-)  # null without an outage, of what is not estimated
+UNASKED = ("outage_position_rms_m", ".observed")  # null without an outage, of what is not estimated
 LIMIT_S = 120.0  # of computing, for a log of seconds
 
 
