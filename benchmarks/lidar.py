@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.rows import Row
-from benchmarks.runs import in_memory, true_states
+from benchmarks.runs import in_memory, points_of, true_states
 from benchmarks.workers import run_all
 from tbmfg.state import POS
 from tbmfg.timeseries import Floats
@@ -115,8 +115,7 @@ def kiss_poses(simulation: Simulation) -> Floats:
     config.mapping.voxel_size = simulation.rig.sensors["lidar"].voxel
     kiss, poses = KissICP(config), []
     for _, fields in simulation.clouds[0]:
-        points = np.column_stack([fields[axis] for axis in "xyz"]).astype(float)
-        kiss.register_frame(points, fields["time"].astype(float))
+        kiss.register_frame(points_of(fields), fields["time"].astype(float))
         poses.append(kiss.last_pose)
     return np.array(poses)
 

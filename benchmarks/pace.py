@@ -2,7 +2,7 @@
 
 emd      mode decomposition of a standing roadheader's six axes with its pump on, 475 Hz
 lidar    a drive through a tunnel, 28 800 points at 10 Hz: from the log on disk to the problem, with all else in it
-bare     of that, the scans' registration by KISS-ICP alone, on the same motion-compensated points
+bare     KISS-ICP alone, its cost beside ours on the same points, neither with compensation of the motion in a scan
 
 times_real_time  seconds of log in a second of wall time
 cost, ratio      CPU time of a scan, and over that of bare KISS-ICP; medians
@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.rows import Row
-from benchmarks.runs import in_memory
+from benchmarks.runs import in_memory, points_of
 from benchmarks.scans import bare_kiss, ours
 from benchmarks.workers import run_all
 from tbmfg.errors import TbmfgError
@@ -89,12 +89,6 @@ def lidar(duration_s: float, more: int) -> Iterator[Row]:
     yield Row("tbm-tunnel", "lidar", "ratio", "", ratio, None, len(scans), (None, RATIO))
     [growth] = run_all(_growth, [(*scans[-1], sensor, more)], 1, "pace")  # a process whose peak is its own
     yield Row("tbm-tunnel", "lidar", "growth", "", growth, None, more, (None, GROWTH))
-
-
-def points_of(fields: dict[str, Floats]) -> Floats:
-    """The points (n, 3) of a cloud that hit something."""
-    points = np.column_stack([fields[axis] for axis in "xyz"]).astype(float)
-    return points[np.isfinite(points).all(axis=1)]
 
 
 def _growth(job: tuple[Floats, float, Lidar, int]) -> float:

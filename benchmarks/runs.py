@@ -137,6 +137,11 @@ def held(log: Log) -> Log:
     return replace(log, clouds=clouds)
 
 
+def points_of(fields: dict[str, np.ndarray]) -> Floats:
+    """The points of a cloud, (n, 3), all of them."""
+    return np.column_stack([fields[axis] for axis in "xyz"]).astype(float)
+
+
 def measure(job: Job, simulation: Simulation, problem: Problem, bounds: Bounds, result: Result) -> Measured:
     """Errors of ``result`` against the simulation's truth at the keyframes themselves, not interpolated."""
     from tbmfg.estimators import ESTIMATORS

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.rows import Row
+from benchmarks.runs import points_of
 from benchmarks.workers import bar
 from tbmfg.timeseries import Floats
 
@@ -134,7 +135,7 @@ def _gicp(voxel: float) -> Register:
 
 def _points(source) -> Iterator[Floats]:
     for _, fields in source:
-        points = np.column_stack([fields[axis] for axis in "xyz"]).astype(float)
+        points = points_of(fields)
         yield points[np.einsum("ni,ni->n", points, points) > 0.25]
 
 

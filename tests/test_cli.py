@@ -17,7 +17,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from tbmfg import cli, doctor, pipeline
+from tbmfg import cli, pipeline
 from tbmfg.cli import options, terminal
 from tbmfg.cli.terminal import Level, Terminal
 from tbmfg.errors import EstimationError, LogError, TbmfgError, reason
@@ -344,40 +344,6 @@ def test_completion_knows_estimators_and_rigs():
         [sys.executable, "-m", "tbmfg", "--show-completion", "bash"], capture_output=True, text=True, cwd=ROOT
     )
     assert "_TBMFG_COMPLETE" in shown.stdout
-
-
-# ---- the installation ----
-
-
-def test_doctor_finds_all_well_and_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr(doctor, "REQUIRED", ("gtsam", "mcap_ros2"))
-    monkeypatch.setattr(doctor, "OPTIONAL", {})
-    well = tbmfg("doctor")
-    assert well.exit_code == 0, well.output
-    assert "ok     gtsam: " in well.stdout
-    assert "smoothed to" in well.stdout
-    assert "broken" not in well.stdout
-    monkeypatch.setattr(doctor, "REQUIRED", ("numpy", "no_such_package"))
-    monkeypatch.setattr(doctor, "OPTIONAL", {"no_such_option": "nothing"})
-    monkeypatch.setattr(doctor, "_self_test", lambda: 1 / 0)
-    ill = tbmfg("doctor", "--json")
-    assert ill.exit_code == 1
-    found = {check["name"]: check for check in json.loads(ill.stdout)}
-    assert found["no_such_package"]["state"] == "broken"
-    assert "pip install no-such-package" in found["no_such_package"]["remedy"]
-    assert found["no_such_option"]["state"] == "absent"
-    assert "ZeroDivisionError" in found["self-test"]["found"]
-
-
-def test_the_self_test_sees_an_estimate_that_is_off(monkeypatch):
-    def shifted(rng):
-        log, truth = circle(rng)
-        return log, lambda t_s: truth(t_s) + np.array([0.0, 0.1, 0.0])
-
-    circle = doctor.circle
-    monkeypatch.setattr(doctor, "circle", shifted)
-    with pytest.raises(ArithmeticError, match="of its sds off"):
-        doctor._self_test()
 
 
 # ---- faults ----

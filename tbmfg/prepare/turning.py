@@ -28,10 +28,8 @@ BOUND = 3.0  # times the usual residual from which a span loses weight
 WIDE = np.repeat([np.pi, 0.1], 3)  # rad, rad/s: sds of what no turn shows
 PULL = 0.01  # share of the turns with which the rig's mounting counts where they leave it open
 
-LATEST_S, APART_S = (
-    2.0,
-    0.1,
-)  # lateness that is looked for, in such pieces: what is turned in some seconds tells no other
+LATEST_S = 2.0  # lateness that is looked for: what is turned in some seconds tells no other
+APART_S = 0.1  # in such pieces
 RARELY = 1e-4  # of logs whose clock keeps its step, in how many one may be found
 ASTRAY = 4.0  # times the usual residual that a span is held against a lateness with: it alone is no step
 PASSES = 3
